@@ -5,6 +5,7 @@ import pathlib
 import queue
 import re
 import runpy
+import signal
 import sys
 import textwrap
 import threading
@@ -186,6 +187,15 @@ def test_command_is_a_module_too_and_shows_its_progress(master):
     session.expect('[0-9]+ s of ROS time\r')
     session.expect_exact('600.0 s of ROS time took')
     session.expect(pexpect.EOF)
+
+
+def test_status_of_a_cut_run_is_that_of_ctrl_c(master, bench):
+    path = bench.write(f"{INIT}say('ready')\nwhile not rospy.is_shutdown(): rospy.sleep(0.1)\n")
+    with bench.program('--for', '1e9', '--script', path) as composed:
+        bench.until(bench.said)
+        composed.signal(signal.SIGINT)
+        assert composed.wait() == 130
+    assert 'Traceback' not in composed.output
 
 
 def test_seeds_show_a_race(master):

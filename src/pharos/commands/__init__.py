@@ -44,6 +44,6 @@ def run_command(name: str, module_name: str = '') -> int:
         package = str(error.name).lower()
         print(f'{name}: {error}: on Debian, apt install python3-{package}', file=sys.stderr)
         return 1
-    except KeyboardInterrupt:  # the usual end of a command that runs on
-        pass
+    except KeyboardInterrupt:
+        return 130  # as a shell has it
     return 0
