@@ -189,6 +189,15 @@ def test_command_is_a_module_too_and_shows_its_progress(master):
     session.expect(pexpect.EOF)
 
 
+@pytest.mark.parametrize('options', [['--for', '9'], ['--expect', 'good.bag']])
+def test_prompt_refuses_options_of_a_whole_run(master, options):
+    with Program(
+        [*COMPOSE, '--at', '3', *options, 'robot', 'robot.launch'], master.url
+    ) as composed:
+        assert composed.wait() == 2
+    assert '--at opens a prompt: leave out --for and --expect, or --at' in composed.output
+
+
 def test_status_of_a_cut_run_is_that_of_ctrl_c(master, bench):
     path = bench.write(f"{INIT}say('ready')\nwhile not rospy.is_shutdown(): rospy.sleep(0.1)\n")
     with bench.program('--for', '1e9', '--script', path) as composed:

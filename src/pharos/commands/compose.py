@@ -109,8 +109,8 @@ def _parse(arguments):
         parser.error('give a launch file, or programs')
     if options.script and (options.file or names_nodes) or len(options.file) > 2:
         parser.error('give one launch file, by package and name or by its path, first; or --script')
-    if options.expect and options.at is not None:
-        parser.error('--expect compares a whole run: give --for or --bag, and leave out --at')
+    if options.at is not None and (options.expect or options.seconds):
+        parser.error('--at opens a prompt: leave out --for and --expect, or --at')
     return options
 
 
