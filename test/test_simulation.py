@@ -720,6 +720,16 @@ def test_time_goes_on_to_a_second_and_a_moment(simulation, create_node):
         simulation.at(400)
 
 
+def test_seconds_count_from_the_begin(simulation, bench):
+    """The start of a program takes some time, and the program's seconds come so much later."""
+    with bench.load(f'{INIT}while True: say(rospy.get_time()); rospy.sleep(1)\n'):
+        start = simulation.seconds
+        simulation.at(3)
+        assert 0 < start < 0.1 and len(bench.said()) == 3
+        simulation.run(start)
+        assert len(bench.said()) == 4
+
+
 def test_failed_test_names_the_command(simulation, bench):
     simulation.seed(7)
     with simulation.master.compose('robot', 'robot.launch'):

@@ -50,6 +50,9 @@ def compose(arguments: list[str]) -> int:
 
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
     says which and why. It ends when all nodes have ended, or by Ctrl-C.
+
+    --for and --at count from the begin: programs start shortly after it, so a beat each second comes shortly
+    after each second.
     """
     options = _parse(arguments)
     mappings = [each for each in sys.argv if ':=' in each]
@@ -73,7 +76,9 @@ def _parse(arguments):
     for name, text in SWITCHES.items():
         parser.add_argument(f'--{name}', action='store_true', help=text)
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
-    parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
+    parser.add_argument(
+        '--for', type=float, dest='seconds', help='in virtual time: end at this second; no bag'
+    )
     parser.add_argument('--at', type=float, help='in virtual time: a prompt at this second')
     parser.add_argument(
         '--record',

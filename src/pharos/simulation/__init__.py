@@ -164,7 +164,7 @@ class Simulation:
                 self.fail(error)
 
     def run(self, seconds: float) -> None:
-        """Let so many seconds of ROS time go by."""
+        """Let so many seconds of ROS time go by, from now on; what is due at their end happens, too."""
         self.wait(self.time_after(seconds), LAST)
 
     @property
@@ -180,7 +180,7 @@ class Simulation:
         return f'rosrun pharos compose {options} {self.launch_file}'
 
     def at(self, seconds: float) -> None:
-        """Go on to that time, in seconds since the begin.
+        """Go on to that time, in seconds since the begin, as ``compose --for`` and ``--at`` do.
 
         :raises ValueError: if it has passed
         """
