@@ -611,15 +611,16 @@ def session(master, bench):
 
 
 def test_prompt_goes_to_times_and_back(session):
-    look = "print(now, node('/loop').count, node('/mouth').spoken, node('/mouth').mouth.spoken)"
+    look = "print(now, node('/loop').count, node('mouth').spoken, node('/mouth').mouth.spoken)"
     first = session.ask(look)
     assert first.split() == ['12.3', '25', '24', '24']
+    assert session.ask("topic('word').data").strip().endswith("'24'")
     assert "data: \"24\"" in session.ask("topic('/word')")
     assert 'True' in session.ask("until(lambda: node('/mouth').is_tired)")
     assert session.ask('print(now, node("/mouth").spoken)').split()[1] == '30'
     assert 'has no nix' in session.ask("until(lambda: node('/mouth').nix)")
-    assert 'there is no node /nix' in session.ask("node('/nix')")
-    assert 'had no message' in session.ask("topic('/nix')")
+    assert 'there is no node /nix' in session.ask("node('nix')")
+    assert '/nix had no message' in session.ask("topic('nix')")
     session.ask('at(20)')
     assert session.ask(look).split()[1] == '41'
     session.ask('at(12.3)')

@@ -10,6 +10,7 @@ from typing import Any, Callable
 
 from pharos.errors import PharosError, UnknownNodeError, UnknownTopicError
 from pharos.live.editing import editable_modules
+from pharos.names import full_name
 
 LIMIT = 600.0  # seconds of ROS time
 HELP = (
@@ -152,6 +153,7 @@ class Prompt:
 
     def _find(self, name):
         nodes = {node.name: node for node in self._simulation.master.own_nodes()}
+        name = full_name(name)
         if name not in nodes:
             raise UnknownNodeError(f'there is no node {name} now: there are {", ".join(nodes)}')
         return nodes[name]
@@ -159,6 +161,7 @@ class Prompt:
     def topic(self, name: str) -> Any:
         """Return the last message of a topic."""
         messages = self._simulation.last_messages
+        name = full_name(name)
         if name not in messages:
             raise UnknownTopicError(f'{name} had no message; these had: {", ".join(messages)}')
         return messages[name]
