@@ -199,7 +199,8 @@ def test_prompt_refuses_options_of_a_whole_run(master, options):
 
 
 def test_status_of_a_cut_run_is_that_of_ctrl_c(master, bench):
-    path = bench.write(f"{INIT}say('ready')\nwhile not rospy.is_shutdown(): rospy.sleep(0.1)\n")
+    say = "rospy.sleep(9)\nsay('ready')\n"
+    path = bench.write(f'{INIT}{say}while not rospy.is_shutdown(): rospy.sleep(0.1)\n')
     with bench.program('--for', '1e9', '--script', path) as composed:
         bench.until(bench.said)
         composed.signal(signal.SIGINT)
@@ -580,9 +581,9 @@ PROMPT = r'(?:>>> |In \[\d+\]: |\(step\) )$'
 class Session:
     """A session at the prompt of compose --at, as a person has it."""
 
-    def __init__(self, seconds, *arguments):
+    def __init__(self, seconds, *arguments, **environ):
         command = [*COMPOSE, '--at', seconds, *arguments]
-        environ = {**os.environ, 'IPY_TEST_SIMPLE_PROMPT': '1', 'TERM': 'dumb'}
+        environ = {**os.environ, 'IPY_TEST_SIMPLE_PROMPT': '1', 'TERM': 'dumb', **environ}
         self.process = pexpect.spawn(
             command[0], command[1:], encoding='utf-8', timeout=TIMEOUT, env=environ, echo=False
         )
@@ -637,6 +638,37 @@ def test_prompt_goes_back_in_the_first_environment(master, bench):
     session.ask('at(0)')
     assert 'Program' in session.ask("node('/foo/program')")
     assert session.end() == 0
+
+
+@pytest.mark.parametrize('term', ['xterm', 'dumb'])
+def test_ctrl_c_clears_a_line_of_the_prompt_and_stops_the_robot(master, bench, term):
+    """Python's own prompt, since IPython is not there."""
+    (bench.folder / 'IPython.py').write_text('raise ImportError')
+    path = f'{bench.folder}:{os.environ["PYTHONPATH"]}'
+    far = "    if count == 99: say('far')\n"
+    loop = bench.write(f'{INIT}count = 0\n{STEPS["loop"]}{far}')
+    session = Session('3', '--script', loop, TERM=term, PYTHONPATH=path)
+    for _ in range(2):
+        session.process.send('nix')
+        session.process.expect('nix')  # by then, it waits for a key
+        session.process.sendcontrol('c')
+        session.process.expect(PROMPT)
+        assert 'KeyboardInterrupt' in session.process.before
+    look = "print(now, node('program').count)"
+    first = session.ask(look).split()[-2:]
+    assert first[0] == '3.0'
+    session.process.sendline('at(1e9)')
+    bench.until(bench.said)
+    session.process.sendcontrol('c')
+    session.process.expect(PROMPT)
+    now, count = session.ask(look).split()[-2:]
+    session.ask('at(now + 10)')
+    later, more = session.ask(look).split()[-2:]
+    assert float(first[0]) < float(now) < 1e9
+    assert float(later) == pytest.approx(float(now) + 10) and int(more) == int(count) + 20
+    session.process.sendline('exit()')
+    session.process.expect(pexpect.EOF)
+    assert 'the end waits' not in session.process.before
 
 
 @pytest.mark.skipif('COVERAGE_PROCESS_START' in os.environ, reason='coverage traces, too')

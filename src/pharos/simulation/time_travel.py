@@ -4,6 +4,7 @@ from __future__ import annotations
 import code
 import gc
 import pdb
+import signal
 import sys
 import weakref
 from typing import Any, Callable
@@ -114,9 +115,8 @@ class Prompt:
 
     def interact(self) -> None:
         """Open the prompt; return at its end."""
-        self._names['now'] = self._simulation.seconds
         text = f'{self._simulation.seconds:.3f} s. {HELP}'
-        self._simulation.pause()
+        self._stand_still()
         try:
             import IPython
         except ImportError:
@@ -125,16 +125,23 @@ class Prompt:
             code.interact(text, local=self._names, exitmsg='')
         else:
             IPython.embed(banner1=text, user_ns=self._names, confirm_exit=False)
-        self._simulation.resume()
+        finally:  # the end is virtual, too
+            self._simulation.resume()
+
+    def _stand_still(self):
+        """End what :meth:`_run` has begun; Ctrl-C clears the line."""
+        self._names['now'] = self._simulation.seconds
+        self._simulation.pause()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _run(self, block, *args):
-        """Call a block while the robot may move."""
+        """Call a block while the robot may move; Ctrl-C stops the robot."""
         self._simulation.resume()
+        signal.signal(signal.SIGINT, lambda *_: self._simulation.wake())
         try:
             return block(*args)
         finally:
-            self._names['now'] = self._simulation.seconds
-            self._simulation.pause()
+            self._stand_still()
 
     def at(self, seconds: float) -> None:
         """Go to a time: on from here, or back, by a new process that does the same."""
