@@ -200,6 +200,15 @@ def test_latched_message_reaches_late_subscriber(node, other):
     assert take(mailbox, 2) == ['new', 'newest']
 
 
+def test_latched_message_wakes_a_node_that_has_heard_others(node, other):
+    """The thread of its delegates rests; no further message comes."""
+    node.output_channel('/map', STRING, latch=True).send(data='map')
+    words = Mailbox(other, '/words', STRING)
+    node.send_to('/words', data='word')
+    assert words.next().data == 'word'
+    assert Mailbox(other, '/map', STRING).next().data == 'map'
+
+
 def test_unlatched_channel_beside_a_latched_one(node, other):
     latched = node.output_channel('/map', STRING, latch=True)
     unlatched = node.output_channel('/map', STRING)
