@@ -6,6 +6,8 @@ import re
 import shlex
 import signal
 import subprocess
+import sys
+import sysconfig
 import tempfile
 import xml.etree.ElementTree
 
@@ -421,6 +423,36 @@ def test_top_tells_cpu_of_nodes(master):
         computing, idle = row_of('/computing', top.output), row_of('/idle', top.output)
     # beside load, the answer to top takes the idle one a good part of a core
     assert float(computing['CPU%']) > float(idle['CPU%'])
+
+
+def test_top_names_module_that_turned_lock_on(master, monkeypatch):
+    """The warning is that of a free-threaded Python; on any other one it is not there."""
+    node = create(master, '/locked')
+    assert node.health().lock == ''
+    text = "The global interpreter lock (GIL) has been enabled to load module 'spam', which has not"
+    warnings = {'version': 0, (text, RuntimeWarning, 488): True}
+    bootstrap = sys.modules['_frozen_importlib']
+    monkeypatch.setattr(bootstrap, '__warningregistry__', warnings, raising=False)
+    assert node.health().lock == 'spam has turned the lock on'
+    with program('top', master.url) as top:
+        assert top.wait() == 0
+    assert re.search('^/locked .* spam has turned the lock on', top.output, re.MULTILINE)
+
+
+@pytest.mark.skipif(
+    not sysconfig.get_config_var('Py_GIL_DISABLED'), reason='this Python always has its lock'
+)
+def test_module_without_a_word_on_the_lock_is_named(master):
+    code = (
+        'import netifaces, pharos\n'
+        'node = pharos.Master().create(pharos.BlockNode, named="/locked")\n'
+        'print(node.health().lock)\n'
+    )
+    environment = {**os.environ, 'ROS_MASTER_URI': master.url}
+    environment.pop('PYTHON_GIL', None)
+    command = [sys.executable, '-c', code]
+    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, timeout=TIMEOUT)
+    assert output.stdout == b'netifaces has turned the lock on\n'
 
 
 def test_keys_of_top_restart_a_node_and_a_save_reloads_it(master, tmp_path):

@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import collections
+import re
+import sys
 import time
 from contextlib import suppress
 from typing import Any
@@ -24,7 +26,16 @@ def facts_of(run: Any) -> dict[str, Any]:
         'ended_souls': list(run.ended_souls),
         'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
         'waiting': sum(len(queue.jobs) for queue in queues),
+        'lock': _lock_text(),
     }
+
+
+def _lock_text():
+    """Return a text if an import has turned the interpreter's lock on, '' if none has."""
+    # a free-threaded Python warns of it, and keeps the warning here; others have no such warning
+    warnings = getattr(sys.modules['_frozen_importlib'], '__warningregistry__', '')
+    match = re.search(r"\(GIL\) .* module '(.+?)'", str(warnings))
+    return f'{match[1]} has turned the lock on' if match else ''
 
 
 def _cpu_seconds(run):

@@ -69,7 +69,7 @@ def node_rows(snapshot: Snapshot, start: Snapshot) -> list[dict[str, Any]]:
                 'TCP': transports.count('TCPROS'),
                 'DROP': node.health.get('dropped'),
                 'FAIL': node.health.get('errors'),
-                'PROBLEM': node.problem or _hang(node.health),
+                'PROBLEM': node.problem or _hang(node.health) or node.health.get('lock'),
             }
         )
     return rows
