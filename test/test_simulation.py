@@ -652,7 +652,6 @@ def test_ctrl_c_clears_a_line_of_the_prompt_and_stops_the_robot(master, bench, t
     session = Session('3', '--script', loop, TERM=term, PYTHONPATH=path)
     for _ in range(2):
         session.process.send('nix')
-        session.process.expect('nix')  # by then, it waits for a key
         session.process.sendcontrol('c')
         session.process.expect(PROMPT)
         assert 'KeyboardInterrupt' in session.process.before
@@ -690,6 +689,21 @@ def test_prompt_steps_in_a_node(session):
     assert session.ask("step('/loop')")
     session.ask('q')
     assert session.ask("at(12.3); print(1)")  # the node goes on
+    assert session.end() == 0
+
+
+@pytest.mark.skipif('COVERAGE_PROCESS_START' in os.environ, reason='coverage traces, too')
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason='its debugger loses the next line')
+@pytest.mark.parametrize('name, function', [('timer', 'tick'), ('loop', 'rospy.sleep')])
+def test_breakpoint_of_a_step_is_reached(session, name, function):
+    session.ask(f"step('/{name}')")
+    assert 'Breakpoint 1' in session.ask(f'b {function}')
+    for _ in range(2):
+        assert f'{function.rpartition(".")[2]}(' in session.ask('c')
+    session.ask('q')
+    before = float(session.ask('print(now)'))
+    session.ask('at(now + 5)')
+    assert float(session.ask('print(now)')) == before + 5
     assert session.end() == 0
 
 
@@ -1060,7 +1074,16 @@ def test_difference_of_long_values_is_shown(tmp_path):
         for number, text in enumerate(texts)
     ]
     (line,) = differences(*paths, 10.0)
-    assert re.fullmatch('0.000 s /p #0 data: x{30}old -> x{30}new', line)
+    assert re.fullmatch(r'0.000 s /p #0 data: \.\.\.x{30}old -> \.\.\.x{30}new', line)
+
+
+def test_what_comes_after_the_end_is_told_in_one_line(tmp_path):
+    old = bag_of(tmp_path / 'good.bag', *numbers(*range(9)), ('/m', std_msgs.msg.Empty(), 14.0))
+    new = bag_of(tmp_path / 'new.bag', *numbers(*range(4)))
+    assert differences(old, new, 10.0, 0.0, 1.5) == [
+        f'1.500 s the run has ended; {old} goes on: compare runs as long'
+    ]
+    assert '/n #4 is missing' in differences(old, new, 10.0, 0.0, 2.0)[0]
 
 
 def test_recording_of_a_latched_topic_is_latched(simulation, create_node, tmp_path):
@@ -1110,6 +1133,7 @@ def test_command_compares_with_a_recording(master, tmp_path):
     status, output = run('--expect', good)
     assert status == 1
     assert re.search(r'^0\.\d{3} s /cmd_vel #0 linear\.x: 0\.5 -> 0\.50005$', output, re.M)
+    assert 'with --tolerance 0.01 first: none' in output
     assert run('--expect', good, '--tolerance', '1e-3')[0] == 0
 
 

@@ -22,6 +22,7 @@ from pharos.compose.launch_file import LaunchFile
 # of the start: both change to what the robot needs
 FOLDER = os.getcwd()
 ENVIRONMENT = dict(os.environ)
+SMALL = 0.01  # a tolerance that leaves out what a reader of differences hardly looks for
 #: options that take names -> help
 NAMES = {
     'script': 'programs to run',
@@ -164,10 +165,16 @@ def _show_differences(simulation, options):
     from pharos.simulation import open_bag
     from pharos.simulation.comparing import differences
 
-    begin = simulation.begin / 1e9
-    lines = differences(options.expect, options.record, begin, options.tolerance)
+    def lines_of(tolerance):
+        begin, end = simulation.begin / 1e9, simulation.seconds
+        return differences(options.expect, options.record, begin, tolerance, end)
+
+    lines = lines_of(options.tolerance)
     if lines:
         print('\n'.join(lines))
+        larger = lines_of(SMALL)
+        if options.tolerance < SMALL and larger != lines:  # a small one hides what comes after
+            print(f'with --tolerance {SMALL} first: {(larger or ["none"])[0]}')
         if simulation.lost:
             print(f'this run was not exact, since {simulation.lost} lost the turn: run it again')
         return True
@@ -201,7 +208,7 @@ def _begin_simulation(stack, master, options):
 
     simulation = Simulation(master)
     ended = threading.Event()
-    if options.at is None and sys.stderr.isatty():  # a thread from before takes no part
+    if sys.stderr.isatty():  # a thread from before takes no part
         threading.Thread(target=_show_progress, args=[simulation, ended], daemon=True).start()
     stack.enter_context(simulation)
     stack.callback(ended.set)
@@ -226,13 +233,12 @@ def _begin_simulation(stack, master, options):
 
 
 def _show_progress(simulation, ended):
-    """Show the time on the terminal, in one line, unless it stands still at a breakpoint()."""
-    shown = ''
+    """Show the time on the terminal, in one line, unless it stands still at a prompt."""
     while not ended.wait(1):
-        text = f'{simulation.seconds:.0f} s of ROS time'
-        if text != shown:
-            print(text, end='\r', file=sys.stderr)
-        shown = text
+        seconds = simulation.seconds
+        ended.wait(0.05)
+        if simulation.seconds > seconds:
+            print(f'{seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
 
 
 def _simulate(simulation, options):

@@ -123,7 +123,7 @@ class Simulation:
                 yield
             finally:
                 self.close_record()
-            lines = differences(bag, actual, self.begin / 1e9, tolerance)
+            lines = differences(bag, actual, self.begin / 1e9, tolerance, self.seconds)
         if is_new:
             lines = [f'{bag} was not there: it is recorded now']
         if lines:
@@ -391,7 +391,7 @@ class Simulation:
             thread = self._holder
             self._looks += 1
             # beside load, a process may get no processor for the time of some looks
-            self._idle_looks = self._idle_looks + 1 if is_idle and _sleeps(thread) else 0
+            self._idle_looks = self._idle_looks + 1 if is_idle and _others_sleep() else 0
             is_over = self._idle_looks >= 3 or self._looks >= 120
             deadlocks = self.deadlocks()
             if not thread and deadlocks and is_over:
@@ -467,12 +467,14 @@ def _read(path, bag, topics):
         raise PharosError(f'{path} is damaged after {last} s: {error}; see rosbag check') from error
 
 
-def _sleeps(thread):
-    """False if a thread waits for the processor or a disk; True if there is no thread."""
-    if not thread:
-        return True
-    with open(f'/proc/self/task/{thread.native_id}/stat') as file:
-        return file.read().rpartition(')')[2].split()[0] == 'S'
+def _others_sleep():
+    """False if another thread of this process waits for the processor or a disk, perhaps a server's."""
+    states = set()
+    for thread_id in set(os.listdir('/proc/self/task')) - {str(threading.get_native_id())}:
+        with contextlib.suppress(OSError):  # it has ended
+            with open(f'/proc/self/task/{thread_id}/stat') as file:
+                states.add(file.read().rpartition(')')[2].split()[0])
+    return states.isdisjoint('RD')
 
 
 def _place_of(thread):

@@ -12,12 +12,15 @@ import rosbag
 MAX_VALUE = 60  # characters of a value in a line
 
 
-def differences(expected: str, actual: str, begin: float, tolerance: float = 0.0) -> list[str]:
+def differences(
+    expected: str, actual: str, begin: float, tolerance: float = 0.0, end: float = math.inf
+) -> list[str]:
     """Return a line for each topic whose messages differ, the earliest first.
 
     :param expected: the path of the bag that was recorded before
     :param begin: the ROS time at which the run began, in seconds
     :param tolerance: numbers may differ by so much, and times by so many seconds
+    :param end: the second after the begin at which the run has ended; what comes later is told in one line
     """
     found = []
     with rosbag.Bag(expected) as old_bag, rosbag.Bag(actual) as new_bag:
@@ -25,10 +28,12 @@ def differences(expected: str, actual: str, begin: float, tolerance: float = 0.0
         for topic in topics:
             rows = _compare_topic(old_bag, new_bag, topic, tolerance)
             for number, stamp, text in itertools.islice(rows, 1):
-                found.append((stamp, topic, f'#{number} {text}'))
-    return [
-        f'{stamp.to_sec() - begin:.3f} s {topic} {text}' for stamp, topic, text in sorted(found)
-    ]
+                found.append((stamp.to_sec() - begin, topic, f'#{number} {text}'))
+    compared = [row for row in sorted(found) if row[0] < end + 1e-6]
+    lines = [f'{second:.3f} s {topic} {text}' for second, topic, text in compared]
+    if len(compared) < len(found):
+        lines.append(f'{end:.3f} s the run has ended; {expected} goes on: compare runs as long')
+    return lines
 
 
 def _compare_topic(old_bag, new_bag, topic, tolerance) -> Iterator[tuple[int, Any, str]]:
@@ -72,7 +77,10 @@ def _difference(old, new, tolerance, path) -> str:
         texts = [' '.join(str(value).split()) for value in (old, new)]
         # from shortly before the place where they differ
         start = max(0, len(os.path.commonprefix(texts)) - MAX_VALUE // 2)
-        return f'{path[1:]}: ' + ' -> '.join(text[start : start + MAX_VALUE] for text in texts)
+        mark = '...' if start else ''
+        return f'{path[1:]}: ' + ' -> '.join(
+            mark + each[start : start + MAX_VALUE] for each in texts
+        )
     for part_path, old_part, new_part in parts:
         text = _difference(old_part, new_part, tolerance, part_path)
         if text:

@@ -73,18 +73,23 @@ class Program:
 
 
 class Debugger(pdb.Pdb):
-    """The debugger of a step: ``c``, ``q`` and the return of the frame lead back to the prompt."""
+    """The debugger of a step: ``c``, ``q`` and the return of the frame lead back to the prompt.
+
+    If there are breakpoints (``b 60``), ``c`` and the return lead on to the next one in this thread.
+    """
 
     def __init__(self, simulation):
-        super().__init__(nosigint=True)
+        super().__init__(nosigint=True, skip=['pharos.*'])
         self._simulation = simulation
         self.prompt = '(step) '
 
     def begin(self, frame):
         """Debug a frame, and what it calls."""
         self.reset()
-        self.botframe = frame
-        frame.f_trace = self.trace_dispatch
+        self.botframe = caller = frame
+        while caller:  # it may have a breakpoint, too
+            caller.f_trace = self.trace_dispatch
+            caller = caller.f_back
         self.set_next(frame)
         sys.settrace(self.trace_dispatch)
 
@@ -95,9 +100,12 @@ class Debugger(pdb.Pdb):
 
     def set_continue(self):
         super().set_continue()
-        self._simulation.wake()
+        if not self.breaks:
+            self._simulation.wake()
 
-    set_quit = set_continue
+    def set_quit(self):
+        self.clear_all_breaks()
+        self.set_continue()
 
 
 class Prompt:
