@@ -31,6 +31,12 @@ NAMES = {
     'here': 'these here, though they show windows',
     'topics': 'of the bag, these topics alone',
 }
+#: options that take a bag -> help
+BAGS = {
+    'bag': 'virtual time: play this',
+    'record': 'in virtual time: write what nodes publish to this bag',
+    'expect': 'in virtual time: show what differs from this recording',
+}
 #: options without a value -> help
 SWITCHES = {
     'own-connections': 'nodes that hear one topic of one process have a connection each',
@@ -76,21 +82,12 @@ def _parse(arguments):
     )
     for name, text in SWITCHES.items():
         parser.add_argument(f'--{name}', action='store_true', help=text)
-    parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
+    for name, text in BAGS.items():
+        parser.add_argument(f'--{name}', type=os.path.abspath, help=text)  # type: ignore
     parser.add_argument(
         '--for', type=float, dest='seconds', help='in virtual time: end at this second; no bag'
     )
     parser.add_argument('--at', type=float, help='in virtual time: a prompt at this second')
-    parser.add_argument(
-        '--record',
-        type=os.path.abspath,  # type: ignore[arg-type]
-        help='in virtual time: write what nodes publish to this bag',
-    )
-    parser.add_argument(
-        '--expect',
-        type=os.path.abspath,  # type: ignore[arg-type]
-        help='in virtual time: show what differs from this recording',
-    )
     parser.add_argument(
         '--tolerance',
         type=float,
