@@ -679,6 +679,17 @@ def test_interrupt_while_it_is_imported_is_silent(master, tmp_path):
     assert composed.output == 'imports\n'
 
 
+def test_second_composition_is_refused_without_a_traceback(bench):
+    file = bench.launch_file(program=SPIN)
+    with bench.program(file) as first:
+        bench.until(bench.said)
+        with Program([*COMPOSE, file], bench.master.url) as second:
+            second.expect('/program has ended, with exit code 1')
+        assert 'NodeNameInUseError: /program is running already, at' in second.output
+        assert 'Traceback' not in second.output
+        assert not first.has_ended
+
+
 def test_program_takes_only_and_apart(master, bench):
     chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
     with bench.program('robot', 'robot.launch', 'robot:=r2', *chosen) as composed:

@@ -233,7 +233,7 @@ class Composition:
         try:
             yield
         except PharosError as error:
-            Transcript.show(f'{name} is not started: {error}')
+            Transcript.show(f'{name} cannot run: {error}')
 
     def _start(self, entry: Entry, owns_process: bool) -> None:
         """Start a program as a node of this process.

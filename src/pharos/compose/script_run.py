@@ -217,9 +217,10 @@ class ScriptRun(Run):
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
         errors = [failure.error for failure in self.failures if failure.block == node.path]
         if errors and not self.is_known:
-            error = errors[-1]
-            error_class = type(error) if isinstance(error, PharosError) else PharosError
-            raise error_class(f'{node.path} ended before it was a node: {error!r}') from error
+            if isinstance(errors[-1], PharosError):
+                raise errors[-1]
+            text = f'{node.path} ended before it was a node: {errors[-1]!r}'
+            raise PharosError(text) from errors[-1]
 
     @property
     def is_known(self) -> bool:
@@ -314,7 +315,11 @@ class ScriptRun(Run):
         except SystemExit as error:
             return self._status_of(error)
         except BaseException as error:
-            self.modules.by_name['sys'].excepthook(type(error), error, error.__traceback__)
+            # as of a name in use: the text says all
+            is_clear = isinstance(error, PharosError) and not self.is_known
+            self.modules.by_name['sys'].excepthook(
+                type(error), error, None if is_clear else error.__traceback__
+            )
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
             self.keep_failure(error, self.node.path)
