@@ -25,6 +25,8 @@ def logged(function):
 @logged
 def shape(value):
     return value
+@functools.lru_cache(None)
+def scale(): return 0
 class Filter:
     bias = 0
     seen = []
@@ -40,7 +42,7 @@ class Filter:
     def see(self, message):
         self.seen.append(message)
         self.extra = self.offset()
-        self.out.publish(1000 * len(self.seen) + shape(GAIN) + self.bias + helper.more() + self.extra)
+        self.out.publish(1000 * len(self.seen) + shape(GAIN) + self.bias + helper.more() + self.extra + scale())
 def main():
     rospy.init_node('program')
     Filter()
@@ -65,6 +67,7 @@ EDITS = {
     'class attribute': ('bias = 0', 'bias = 7', 8),
     'callback': ('+ shape', '+ 2 * shape', 2),
     'decorated function': ('return value', 'return value + 2', 3),
+    'cached function': ('scale(): return 0', 'scale(): return 8', 9),
     'new import': ('import functools', 'import math, functools\nGAIN = 4', 4),
     'another function imported': ('import join', 'import dirname as join\nGAIN = 4', 4),
     'method': ('    def see', '    bias = 6\n    def more(self): pass\n    def see', 7),

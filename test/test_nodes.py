@@ -782,3 +782,11 @@ def test_health_counts_souls_and_the_log_names_what_is_left(master):
     log.wait_for(lambda line: 'left behind' in line.msg and 'stubborn' in line.msg)
     assert '/node' not in str(master.system_state())
     free.set()
+
+
+def test_log_names_a_delegate_that_is_left(master):
+    log = Mailbox(create(master, '/log'), '/rosout', 'rosgraph_msgs/Log')
+    ear, gate, *_ = fill(master)
+    ear.stop()
+    log.wait_for(lambda line: 'left behind' in line.msg and 'a delegate' in line.msg)
+    gate.open.set()

@@ -439,6 +439,20 @@ spin()
         assert program.wait() == 0
 
 
+def test_spin_names_the_node_whose_soul_nobody_runs(master):
+    source = '''
+from pharos import BlockNode, Master, spin
+Master().create(BlockNode, '/busy', soul=lambda me: me.sleep(60)).fork()
+Master().create(BlockNode, '/idle', soul=lambda me: me.sleep(60))
+spin()
+'''
+    with Program(source, master.url) as program:
+        program.expect('/idle: nobody runs the soul')
+        program.signal(signal.SIGINT)
+        program.wait()  # with either status: the signal may come before the wait of spin()
+    assert program.output.count('nobody runs') == 1
+
+
 def test_transcript_shows_on_standard_output(master, capsys):
     Transcript.show('a line')
     Transcript.show(42)
