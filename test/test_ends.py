@@ -127,6 +127,25 @@ def test_end_waits_for_no_thread_of_a_library(bench):
     assert_ends_within(bench, 5, text)
 
 
+@pytest.mark.parametrize(
+    'sleep', ['rospy.sleep(1000)', 'time.sleep(1000)', 'rospy.Rate(1e-3).sleep()']
+)
+def test_daemon_thread_sleeps_on_at_the_end(bench, sleep):
+    """It runs no further line: a process would be gone."""
+    text = f"""
+def work():
+    say('ready')
+    {sleep}
+    say('it goes on')
+threading.Thread(target=work, daemon=True).start()
+rospy.spin()
+"""
+    script = bench.load(INIT + text)
+    until(bench.said)
+    script.stop()
+    assert bench.said() == ['ready'] and not script.failures
+
+
 def test_slow_end_is_told(bench):
     text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(4))\n"
     text += "rospy.sleep(0.5)\n" + SPIN

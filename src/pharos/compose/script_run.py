@@ -373,21 +373,23 @@ class ScriptRun(Run):
     def sleep(self, seconds: float) -> None:
         """Stand in for ``time.sleep``: a signal ends a sleep of the main thread.
 
-        A stop ends sleeps of other threads. Once ``stopping`` is set, the main thread sleeps as
-        usual, and other threads end with the run.
+        A stop ends sleeps of threads that the program's end waits for, and of those that answer a call of a
+        service. Daemon threads sleep on, and end with the run. Once ``stopping`` is set, the main
+        thread sleeps as usual, and all others end with the run.
         """
-        if threading.current_thread() is not self.main:
-            if not self.stopping.is_set():
-                super().sleep(seconds)
-                return
-            is_finished = self.finished.wait(seconds)
-            if is_finished:
-                raise SystemExit
-        elif self.stopping.is_set() or seconds <= 0:
-            time.sleep(seconds)
-        else:
-            self.pending_signal.wait(seconds)
-            self.handle_signal()
+        thread = threading.current_thread()
+        if thread is self.main:
+            if self.stopping.is_set() or seconds <= 0:
+                time.sleep(seconds)
+            else:
+                self.pending_signal.wait(seconds)
+                self.handle_signal()
+            return
+        is_awaited = thread in self.threads_to_join or current.service_run is self
+        if seconds <= 0 or is_awaited and not self.stopping.is_set():
+            super().sleep(seconds)
+        elif self.finished.wait(seconds):
+            raise SystemExit
 
     def checkpoint(self) -> None:
         """Have the main thread wait while another thread handles a signal, for STOP_LIMIT at most.

@@ -198,7 +198,6 @@ class CallbackQueue:
                 self._run_next()
         finally:
             self._was_slow = time.perf_counter() - begin_time > SLOW
-            self.begin_time = None
             self.order.pass_turn()
 
     def run_jobs_here(self) -> None:
