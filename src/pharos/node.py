@@ -330,7 +330,8 @@ class Node(DelegateHolder):
             ``dropped`` (number of messages), ``errors`` (how often blocks failed), ``threads``
             (number), ``cpu_seconds``, ``souls`` (number of those that run in threads),
             ``ended_souls`` (names of the last ten), ``callback_seconds`` (since the callback has begun that runs
-            now), ``waiting`` (number of messages)
+            now), ``waiting`` (number of messages), ``lock`` (a text if an import has turned the lock of a
+            free-threaded Python on again, else '')
         """
         if not self._current_run:
             self._check_active()  # raises

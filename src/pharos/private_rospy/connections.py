@@ -122,9 +122,9 @@ def _connect(run, topic, uri):
     if run.stopping.is_set() or not subscription or subscription.has_connection(uri):
         return
     key = topic, uri, id(subscription)  # a closed one may still connect
-    if key in run.connecting:
+    this_attempt = object()
+    if run.connecting.setdefault(key, this_attempt) is not this_attempt:
         return
-    run.connecting.add(key)
     try:
         publisher_run = runs.get(uri)
         share = share_of(subscription, uri)
@@ -139,7 +139,7 @@ def _connect(run, topic, uri):
     except Exception as error:  # told by the watcher, which tries again
         connect_later(run, topic, uri, repr(error))
     finally:
-        run.connecting.discard(key)
+        del run.connecting[key]
 
 
 def _negotiate(run, topic, uri, subscription):

@@ -115,8 +115,8 @@ class Run:
         self.publisher_uris: dict[str, list[str]] = {}  # topic -> URIs, the last list of the master
         # (topic, URI) -> the time to connect again, and the last error
         self.retries: dict[tuple[str, str], tuple[float, str]] = {}
-        # (topic, URI, id of the subscription) of attempts that go on
-        self.connecting: set[tuple[str, str, int]] = set()
+        # (topic, URI, id of the subscription) -> an object of the attempt that goes on
+        self.connecting: dict[tuple[str, str, int], object] = {}
         self.callback_order = CallbackOrder(self.start_thread)
         # the pause ends when the node's start() has returned
         self.callback_queue = CallbackQueue(self.callback_order, HOLD_LIMIT)
