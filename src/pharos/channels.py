@@ -250,8 +250,8 @@ class OutputChannel(Channel):
     def publish(self, *values: Any, **fields: Any) -> None:
         """Send a message, or one with these values of all its fields, or with these fields.
 
-        Inline delegates of nodes of this process run before this returns, unless another thread runs a
-        callback of the node. This waits for sockets only without a queue_size. It waits for the threads
+        Inline delegates of nodes of this process run before this returns, unless their node runs a
+        delegate already, or its start(). This waits for sockets only without a queue_size. It waits for the threads
         of receivers: 1 ms at most (YIELD_LIMIT) for each, and for no other after one that took so long.
         If the queue of a receiver is full, its thread may run before each message.
 

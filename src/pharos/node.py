@@ -78,7 +78,8 @@ class Node(DelegateHolder):
     stop_timeout = 2.0
     #: seconds that a client may be silent before the node closes its connection
     client_timeout = 5.0
-    #: bytes of messages that may wait for a slow receiver; a larger message waits alone
+    #: bytes of messages that may wait for a slow receiver, but for those in memory files; a larger
+    #: message waits alone
     queue_bytes = 64 << 20
     #: True if any host may end the node by ROS's shutdown call; False: this host and the master's
     allow_remote_shutdown = False
@@ -366,7 +367,7 @@ class Node(DelegateHolder):
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends the soul at its next
         :meth:`sleep` or turn of :meth:`every`. An exception of the soul goes to :attr:`failures`,
-        but for SystemExit, and a rospy.ROSException after a stop has begun.
+        but for a SystemExit or a rospy.ROSException after a stop has begun.
 
         :param name: the thread's name; default: the block's
         :param required: True: when the soul ends, the node stops, and ``spin()`` ends the program
@@ -416,8 +417,8 @@ class Node(DelegateHolder):
 
         A sleep in start() lets delegates run from now on.
 
-        :raises NodeStoppedError: if the stop has begun before; in a soul and in the block of a service
-            also if it begins meanwhile
+        :raises NodeStoppedError: if the stop has begun before; in a soul also if it begins meanwhile
+        :raises SystemExit: in the block of a service, if the stop begins meanwhile
         """
         self._check_active()
         run = current.run if current.node is self else self._current_run

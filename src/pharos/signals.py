@@ -82,7 +82,7 @@ def _start_stops() -> list[threading.Thread]:
 def spin() -> None:
     """Wait until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them.
 
-    :raises SystemExit: with status 1, as soon as a required soul has ended
+    :raises SystemExit: with status 1, if a required soul has ended: that stops all nodes
     """
     handle_signals()
     for node in live_nodes():

@@ -54,7 +54,7 @@ def start_child(
 ) -> None:
     """Python gives a child the environment of this process. This passes on the program's.
 
-    The end of the program interrupts the child, as roslaunch and a terminal do.
+    The end of a composed program interrupts the child, as roslaunch and a terminal do.
     """
     original(self, *args, env=run.environ if env is None else env, **kwargs)
     former_children = getattr(run, 'children', ())
@@ -66,7 +66,7 @@ class ScriptRun(Run):
     """One run of a program.
 
     "The main thread" is the thread that runs the program. A stop sets the following attributes, in
-    this order.
+    this order, if the main thread ends in time.
 
     :ivar pending_signal: a signal waits for the main thread; clear while the program's handlers run
     :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
@@ -75,7 +75,8 @@ class ScriptRun(Run):
     :ivar finished: threads left behind end
     """
 
-    exit_request: SystemExit | None = None  # the SystemExit that a handler or os._exit() raised
+    # the SystemExit that a handler or os._exit() has raised, or the stop of a late main thread
+    exit_request: SystemExit | None = None
     is_registered = False  # True once rospy.init_node() has registered the node
     has_run_hooks = False
     main_has_ended = True  # there is no main thread yet; False from start() on
@@ -287,6 +288,7 @@ class ScriptRun(Run):
         vars(main_module)['__builtins__'] = self.modules.builtins
         self.modules.by_name['__main__'] = main_module
         status = 1  # stays if the program's own sys.excepthook raises an exception
+        own_sys = self.modules.by_name['sys']  # a stop that has not waited takes it away
         try:
             status = self._run_code(code, vars(main_module))
             self._run_all(self.thread_exit_functions, -1)
@@ -294,7 +296,6 @@ class ScriptRun(Run):
             # rospy's own function was the first to be registered, and comes last
             self._run_all(self.exit_functions, -1)
         finally:
-            own_sys = self.modules.by_name['sys']
             for stream in own_sys.stdout, own_sys.stderr, self.stdout, self.stderr:
                 with contextlib.suppress(Exception):  # the program has closed it, or given it away
                     stream.flush()

@@ -2,9 +2,10 @@
 
 A callback queue has one thread. A node has one queue for its delegates, and one for each subscription
 of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
-have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Three other threads run
+have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Four other threads run
 callbacks: a publisher runs the queue of an inline channel, a thread that reads a TCPROS connection
-of one node runs those of plain rospy without a queue_size, and the caller of Failure.retry() runs one.
+of one node runs those of plain rospy without a queue_size, one that subscribes runs a new callback of plain rospy
+on the latched message of another process, and the caller of Failure.retry() runs one.
 """
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ class CallbackOrder:
         has no more threads
     :ivar numbers: the numbers of the messages to come
     :ivar is_paused: True: no callback that waits for its turn begins, for TURN_LIMIT at most
-    :ivar queues: a dict with the open callback queues that have an inbox as its keys
+    :ivar queues: a dict with the callback queues that have an inbox as its keys
     """
 
     def __init__(self, start_thread: Callable) -> None:
@@ -74,7 +75,7 @@ class CallbackQueue:
         subscribe to several topics before it has set all that its callbacks use
     :ivar jobs: the messages of all inboxes, as Inbox says
     :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
-    :ivar running_thread: the identifier of the thread that runs callbacks, or None
+    :ivar running_thread: the identifier of the thread that runs callbacks, or waits for their turn; or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
     :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
     """
@@ -154,7 +155,7 @@ class CallbackQueue:
     # -- running
 
     def run_jobs(self, in_turn: bool = True) -> None:
-        """Run all jobs in this thread, unless another thread does so already.
+        """Run all jobs in this thread, unless another thread does so already, or the first pause goes on.
 
         :param in_turn: False: begin at once, whatever other queues of the node do
         """

@@ -69,7 +69,7 @@ class Inbox(BoundedQueue):
     ``jobs`` runs it or drops it. A run takes it from ``jobs`` first, a drop from ``messages``.
 
     :param callback_queue: the CallbackQueue that runs the callback
-    :param callback: called as ``callback(message)``; raises only what a signal raises
+    :param callback: called as ``callback(message)``; raises no Exception
     :param queue_size: as for BoundedQueue
     :param inline: True: the thread of the publisher runs the callback
     :param shared: True: the callback gets the published object, not a copy

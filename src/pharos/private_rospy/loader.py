@@ -35,7 +35,7 @@ PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil runpy smach'.
 _IMPORT = re.compile(
     r'^\s*(?:from (\w+)[\w.]* import\b|import (\w+)[\w.]*\s*(?:$|[,;#]|as ))', re.M
 )
-SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
+SYSTEM_FOLDERS = '/usr/', '/opt/ros/', os.path.dirname(os.__file__)
 MAX_FILES = 300  # of a package that could be written on rospy
 
 

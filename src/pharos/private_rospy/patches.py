@@ -401,7 +401,8 @@ def cleanup(original: Callable, run: Run, self: Any, reason: str) -> None:
 def send_goal(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any) -> None:
     """actionlib drops an answer that comes before send_goal() returns. Here the answer waits.
 
-    No callback that waits for its turn begins meanwhile: the feedback stays before the result.
+    No callback that waits for its turn begins meanwhile, for TURN_LIMIT at most: the feedback stays
+    before the result.
     """
     order = run.callback_order
     order.is_paused = True

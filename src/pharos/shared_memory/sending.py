@@ -58,7 +58,7 @@ class MemoryFile:
 
 
 class MessageMemory:
-    """The files of a publisher: four, or more while as many readers each read another one."""
+    """The files of a publisher: four, or more once as many readers each read another one at a time."""
 
     def __init__(self, run) -> None:
         self.run = run

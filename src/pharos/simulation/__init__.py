@@ -53,7 +53,8 @@ class Simulation:
     :ivar nanoseconds: the ROS time
     :ivar begin: the ROS time at the begin, in nanoseconds
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
-        without end, and so lost the turn: what follows may come in another order another time
+        without end, and so lost the turn, or had a slow child: what follows may come in another order
+        another time
     :ivar record: None, or the bag that gets what the nodes publish
     """
 
@@ -78,7 +79,9 @@ class Simulation:
         self._holder: Any = self._owner  # the thread with the turn
         self._lock = allocate_lock()  # held while the turn changes
         self.last_messages: dict[str, Any] = {}  # topic -> message
-        self._waits: dict[Any, Any] = {}  # thread -> its wait: (end, order, Lock or None)
+        self._waits: dict[
+            Any, Any
+        ] = {}  # thread -> its wait: (end, order, what it waits for, or None)
         self._orders = itertools.count()
         self._stack = contextlib.ExitStack()
         self.seed(0)
@@ -217,8 +220,8 @@ class Simulation:
     def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
         """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
 
-        :returns: the last value of ``predicate()``, which is called every 20 ms (with a seed, a jitter later),
-            in turn with the other threads
+        :returns: the last value of ``predicate()``, which is called at first after 2 ms, later every 20 ms (with a
+            seed, a jitter later), in turn with the other threads
         """
         return wait(predicate, limit)
 
