@@ -758,6 +758,15 @@ def test_thread_looks_at_a_clock_first_of_all(simulation):
     assert times[0] >= simulation.begin / 1e9
 
 
+def test_failed_start_of_a_thread_leaves_the_time_virtual(simulation):
+    """As a Ctrl-C does while a thread starts."""
+    thread = threading.Thread(target=time.time)
+    thread._started.set()
+    with pytest.raises(RuntimeError):
+        thread.start()
+    assert time.time() == pytest.approx(simulation.now, abs=1e-3)
+
+
 def test_time_goes_on_to_a_second_and_a_moment(simulation, create_node):
     robot = create_node(Docker)
     simulation.at(400)

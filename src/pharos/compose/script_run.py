@@ -569,6 +569,8 @@ def end_reads(thread: threading.Thread) -> None:
 
 def raise_in(thread: threading.Thread, error_class: type[BaseException]) -> None:
     """Raise an exception of a class in a thread, at its next line of Python."""
+    if thread.ident is None:
+        return  # it has not begun
     if sys.version_info[:2] == (3, 11) and sys.gettrace():
         return  # traced threads would stand still until the thread has come to that line
     thread_id = ctypes.c_ulong(thread.ident)

@@ -129,14 +129,16 @@ def start_thread(thread):
     starter = local.thread
     # while it takes part, the starter would give its turn away when _start() waits for the new thread
     local.thread = None
-    if module.startswith(SERVERS):
-        _start(thread)
-    else:
-        _simulation.prepare(thread)
-        thread.run = functools.partial(_simulation.run_thread, thread, thread.run)
-        _start(thread)
-        _simulation.add_wait(thread, _simulation.nanoseconds)
-    local.thread = starter
+    try:
+        if module.startswith(SERVERS):
+            _start(thread)
+        else:
+            _simulation.prepare(thread)
+            thread.run = functools.partial(_simulation.run_thread, thread, thread.run)
+            _start(thread)
+            _simulation.add_wait(thread, _simulation.nanoseconds)
+    finally:  # Ctrl-C may come meanwhile
+        local.thread = starter
 
 
 def join_thread(thread, timeout=None):
