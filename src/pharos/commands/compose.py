@@ -204,11 +204,12 @@ def _begin_simulation(stack, master, options):
     from pharos.simulation import Simulation, open_bag
 
     simulation = Simulation(master)
-    ended = threading.Event()
+    options.end_progress = threading.Event()
     if sys.stderr.isatty():  # a thread from before takes no part
-        threading.Thread(target=_show_progress, args=[simulation, ended], daemon=True).start()
+        arguments = simulation, options.end_progress
+        threading.Thread(target=_show_progress, args=arguments, daemon=True).start()
     stack.enter_context(simulation)
-    stack.callback(ended.set)
+    stack.callback(options.end_progress.set)
     simulation.seed(options.seed, options.jitter)
     if options.bag:
         with open_bag(options.bag) as bag:
@@ -233,8 +234,7 @@ def _show_progress(simulation, ended):
     """Show the time on the terminal, in one line, unless it stands still at a prompt."""
     while not ended.wait(1):
         seconds = simulation.seconds
-        ended.wait(0.05)
-        if simulation.seconds > seconds:
+        if not ended.wait(0.05) and simulation.seconds > seconds:
             print(f'{seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
 
 
@@ -268,6 +268,7 @@ def _open_prompt(simulation, options, close):
     if options.bag:
         threading.Thread(target=play, daemon=True).start()
     simulation.at(max(options.at, simulation.seconds))  # the start may have taken some time
+    options.end_progress.set()
     Prompt(simulation, go_back).interact()
 
 
