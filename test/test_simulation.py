@@ -1145,7 +1145,11 @@ def test_command_compares_with_a_recording(master, tmp_path):
     status, output = run('--expect', good)
     assert status == 1
     assert re.search(r'^0\.\d{3} s /cmd_vel #0 linear\.x: 0\.5 -> 0\.50005$', output, re.M)
-    assert 'with --tolerance 0.01 first: none' in output
+    assert 'none by --tolerance 0.01' in output
+    driver.write_text(DRIVER.replace('= speed', '= speed + 1e-5 + (speed > 0.99)'))
+    text = r'^the first by --tolerance 0\.01: 0\.\d{3} s /cmd_vel #6 linear\.x: 0\.992\d* -> 1\.992\d*$'
+    assert re.search(text, run('--expect', good)[1], re.M)
+    driver.write_text(DRIVER.replace('0.5', '0.50005'))
     assert run('--expect', good, '--tolerance', '1e-3')[0] == 0
 
 

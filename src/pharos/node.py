@@ -418,7 +418,8 @@ class Node(DelegateHolder):
         A sleep in start() lets delegates run from now on.
 
         :raises NodeStoppedError: if the stop has begun before; in a soul also if it begins meanwhile
-        :raises SystemExit: in the block of a service, if the stop begins meanwhile
+        :raises SystemExit: in the block of a service, if the stop begins meanwhile; NodeStoppedError if
+            /use_sim_time is set
         """
         self._check_active()
         run = current.run if current.node is self else self._current_run

@@ -22,7 +22,7 @@ from pharos.compose.launch_file import LaunchFile
 # of the start: both change to what the robot needs
 FOLDER = os.getcwd()
 ENVIRONMENT = dict(os.environ)
-SMALL = 0.01  # a tolerance that leaves out what a reader of differences hardly looks for
+SMALL = 0.01  # a tolerance; smaller differences may hide a larger one that comes later
 #: options that take names -> help
 NAMES = {
     'script': 'programs to run',
@@ -169,9 +169,9 @@ def _show_differences(simulation, options):
     lines = lines_of(options.tolerance)
     if lines:
         print('\n'.join(lines))
-        larger = lines_of(SMALL)
-        if options.tolerance < SMALL and larger != lines:  # a small one hides what comes after
-            print(f'with --tolerance {SMALL} first: {(larger or ["none"])[0]}')
+        left = lines_of(max(SMALL, options.tolerance))
+        if left != lines:
+            _show_first(left)
         if simulation.lost:
             print(f'this run was not exact, since {simulation.lost} lost the turn: run it again')
         return True
@@ -179,6 +179,14 @@ def _show_differences(simulation, options):
         topics = bag.get_type_and_topic_info()[1]
         print(f'as {options.expect}: {bag.get_message_count()} messages of {len(topics)} topics')
     return False
+
+
+def _show_first(lines):
+    """Show the first of the differences that are left by a tolerance of SMALL."""
+    text = f'none by --tolerance {SMALL}'
+    if lines:
+        text = f'the first by --tolerance {SMALL}: {lines[0]}'
+    print(text)
 
 
 def _fix_hashes(seed):
@@ -234,7 +242,8 @@ def _show_progress(simulation, ended):
     """Show the time on the terminal, in one line, unless it stands still at a prompt."""
     while not ended.wait(1):
         seconds = simulation.seconds
-        if not ended.wait(0.05) and simulation.seconds > seconds:
+        has_ended = ended.wait(0.05)
+        if simulation.seconds > seconds and not has_ended:
             print(f'{seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
 
 

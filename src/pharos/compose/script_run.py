@@ -29,7 +29,7 @@ from pharos.blocks import Block, block_name
 import pharos.compose.event_loops  # noqa: F401: it changes asyncio
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
-from pharos.errors import PharosError
+from pharos.errors import NodeNameInUseError, PharosError
 from pharos.live import private_classes
 from pharos.live.editing import editable_modules
 from pharos.private_rospy import loader
@@ -316,11 +316,10 @@ class ScriptRun(Run):
         except SystemExit as error:
             return self._status_of(error)
         except BaseException as error:
-            # as of a name in use: the text says all
-            is_clear = isinstance(error, PharosError) and not self.is_known
-            self.modules.by_name['sys'].excepthook(
-                type(error), error, None if is_clear else error.__traceback__
-            )
+            trace = error.__traceback__
+            if isinstance(error, NodeNameInUseError):  # the text says all
+                trace = None
+            self.modules.by_name['sys'].excepthook(type(error), error, trace)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
             self.keep_failure(error, self.node.path)

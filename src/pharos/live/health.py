@@ -12,7 +12,9 @@ from typing import Any
 def facts_of(run: Any) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health`, but for the master's."""
     queues = list(run.callback_order.queues)
-    begin_times = list(filter(None, [queue.begin_time for queue in queues]))
+    # read once: a callback may end meanwhile
+    begin_times = [queue.begin_time for queue in queues]
+    begin_times = [begin_time for begin_time in begin_times if begin_time]
     return {
         'kind': type(run.node).__name__,
         'connections': dict(

@@ -432,7 +432,8 @@ class Run:
         self.callback_queue.stop()
         late_threads = self.end_program(timeout)
         self._begin_stop()
-        late_souls = join(set(self.souls) - late_threads, timeout)
+        souls = [thread for thread in list(self.souls) if thread not in late_threads]
+        late_souls = join(souls, timeout)
         late_threads.update(late_souls)
         left_behind = [thread.name for thread in late_souls]
         has_ended = self.callback_queue.close(timeout)

@@ -93,7 +93,7 @@ class PublisherOverlay:
 
     def add_receiver(self, connection: Any) -> None:
         """Add a connection or a link, without the messages that are latched."""
-        # that of rospy's base class: _PublisherImpl's sends the latched message, and calls listeners
+        # not _PublisherImpl's own, which also sends the latched message, and calls listeners
         type(self).__base__.add_connection(self, connection)
         self.call_listeners(
             'peer_subscribe', self.publish, lambda message: self.publish(message, connection)
@@ -275,8 +275,8 @@ class PlainInbox(Inbox):
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
         # a publisher without a queue_size loses no message
-        publishers_drop = links and len(links) == len(connections) and all(queue_sizes)
-        if self.queue_size or not publishers_drop:
+        publishers_drop = len(links) == len(connections) and all(queue_sizes)
+        if self.queue_size or not links or not publishers_drop:
             return super().capacity_for(size)
         socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
         return sum(queue_sizes) + max(1, socket_messages)

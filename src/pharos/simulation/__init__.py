@@ -79,9 +79,8 @@ class Simulation:
         self._holder: Any = self._owner  # the thread with the turn
         self._lock = allocate_lock()  # held while the turn changes
         self.last_messages: dict[str, Any] = {}  # topic -> message
-        self._waits: dict[
-            Any, Any
-        ] = {}  # thread -> its wait: (end, order, what it waits for, or None)
+        # thread -> its wait: (end, order, what it waits for, or None)
+        self._waits: dict[Any, Any] = {}
         self._orders = itertools.count()
         self._stack = contextlib.ExitStack()
         self.seed(0)
