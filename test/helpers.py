@@ -53,12 +53,17 @@ class InProcessMaster:
         self.url = f'http://127.0.0.1:{self._master.master_node.port}/'
 
     def forget(self):
-        """Forget parameters and types of topics, so that the next test can use their names."""
+        """Forget parameters, types of topics and addresses of nodes, so that the next test can use their names.
+
+        A rospy node that has logged leaves a parameter subscribed, and the master then knows its address for ever.
+        """
         handler = self._master.handler
         with handler.param_server.lock:
             handler.param_server.parameters.clear()
         with handler.ps_lock:
             handler.topics_types.clear()
+            handler.reg_manager.param_subscribers.map.clear()
+            handler.reg_manager.nodes.clear()
 
     def stop(self):
         """End its server; rosgraph only closes the socket, and its thread spins (ros_comm #2238)."""
