@@ -65,13 +65,13 @@ def start_child(
 class ScriptRun(Run):
     """One run of a program.
 
-    "The main thread" is the thread that runs the program. A stop sets the following attributes, in
-    this order, if the main thread ends in time.
+    "The main thread" is the thread that runs the program. It is one of the run's ``souls`` until the
+    program and its exit functions have ended. A stop sets the following attributes, in this order, if the
+    main thread ends in time.
 
     :ivar pending_signal: a signal waits for the main thread; clear while the program's handlers run
     :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
     :ivar stopping: ``is_shutdown()`` is True
-    :ivar main_has_ended: True: the program and its exit functions have ended
     :ivar finished: threads left behind end
     """
 
@@ -79,7 +79,6 @@ class ScriptRun(Run):
     exit_request: SystemExit | None = None
     is_registered = False  # True once rospy.init_node() has registered the node
     has_run_hooks = False
-    main_has_ended = True  # there is no main thread yet; False from start() on
 
     def __init__(self, node: Any, settings: Any) -> None:
         node.exit_code = 1  # stays if the program cannot be read
@@ -213,7 +212,6 @@ class ScriptRun(Run):
         """
         node = self.node
         self.souls[self.main] = None, False
-        self.main_has_ended = False
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
         errors = [failure.error for failure in self.failures if failure.block == node.path]
@@ -303,7 +301,7 @@ class ScriptRun(Run):
                 if self.exit_request is not None:
                     status = self._status_of(self.exit_request)
                 self.node.exit_code = status
-            self.main_has_ended = True
+            self.mark_ended(self.main)
             signals.silenced_threads.discard(self.main.ident)  # another thread may get the number
             if self.lifecycle not in (Lifecycle.STOPPING, Lifecycle.STOPPED):
                 self.request_stop()
@@ -433,7 +431,7 @@ class ScriptRun(Run):
         What the main thread publishes meanwhile is dropped: a process would stand still. An exception
         of a handler is raised in the main thread, before that publishes again.
         """
-        if not self.main_has_ended:  # else another thread may have the number
+        if self.main in self.souls:  # else another thread may have the number
             signals.silenced_threads.add(self.main.ident)
         try:
             self.handle_signal()
@@ -449,7 +447,7 @@ class ScriptRun(Run):
         """Raise an exception of this class in the main thread, at its next line of Python."""
         if isinstance(error, SystemExit):
             self.exit_request = error
-        if self.main.is_alive() and not self.main_has_ended:
+        if self.main in self.souls:
             raise_in(self.main, type(error))
             for loop in list(self.event_loops):
                 with contextlib.suppress(RuntimeError):  # it is closed
@@ -505,7 +503,7 @@ class ScriptRun(Run):
         left_threads: set[threading.Thread] = set()
         for child in self.children:
             interrupt(child)
-        if not self.main_has_ended:
+        if self.main in self.souls:
             self.pending_signal.set()
             threads = [self.main]
             is_accepted = wait(lambda: not self.pending_signal.is_set(), SIGNAL_LIMIT)

@@ -180,8 +180,12 @@ class Run:
         finally:
             self.ended_cpu_seconds += time.thread_time()
             self.threads.discard(thread)
-            if self.souls.pop(thread, None):
-                self.ended_souls.append(thread.name)
+            self.mark_ended(thread)
+
+    def mark_ended(self, soul_thread: threading.Thread) -> None:
+        """Keep the name of a soul that has ended; do nothing for another thread."""
+        if self.souls.pop(soul_thread, None):
+            self.ended_souls.append(soul_thread.name)
 
     def start_thread(self, target: Callable) -> threading.Thread | None:
         """Start a thread of the node, and return the thread.
