@@ -828,10 +828,11 @@ def test_closed_topic_is_forgotten(master, node, other):
     """Else the node would connect anew to publishers of long ago."""
     node.output_channel('/words', STRING)
     channels = [other.interested_in('/words', STRING) for _ in range(2)]
-    until(lambda: '/words' in other._current_run.publisher_uris)
+    subscriptions = other._current_run.topic_manager.subs
+    until(lambda: subscriptions['/words'].publisher_uris)
     for channel in channels:
         channel.close()
-    assert '/words' not in other._current_run.publisher_uris
+    assert '/words' not in subscriptions
 
 
 # -- two threads at once

@@ -121,7 +121,9 @@ def test_invalid_edit_changes_nothing(bench, program, ask, new):
     text = PROGRAM.replace('GAIN = 1', f'{new}\nGAIN = 2')
     with open(bench.write(text)) as file:
         line = file.read().splitlines().index(new) + 1
-    with pytest.raises(PharosError, match=f'(?s)program:{line}: .*nothing has changed'):
+    with pytest.raises(
+        PharosError, match=f'(?s)program:{line}: .*no function, class or value has changed'
+    ):
         program.reload()
     assert ask() == 1001
 
@@ -171,7 +173,9 @@ def test_answer_says_what_is_so(bench, old, new, lines):
     until(bench.said)
     bench.write(KINDS.replace(old, new))
     if lines is None:
-        with pytest.raises(PharosError, match='SystemExit; nothing has changed'):
+        with pytest.raises(
+            PharosError, match='SystemExit; no function, class or value has changed'
+        ):
             script.reload()
     else:
         answer = script.reload()
@@ -188,7 +192,7 @@ def test_what_has_gone_is_told_after_an_error_elsewhere(bench):
     until(bench.said)
     bench.write(KINDS.replace('class Base: pass', 'class Base: pass\nclass Bad(int, int): pass'))
     bench.write('', 'helper.py', '')
-    with pytest.raises(PharosError, match='nothing has changed'):
+    with pytest.raises(PharosError, match='no function, class or value has changed'):
         script.reload()
     bench.write(KINDS)
     assert 'helper.py: FACTOR has gone; it stays in force' in script.reload()

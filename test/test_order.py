@@ -394,7 +394,7 @@ def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch)
     for topic, callback in callbacks.items():
         node.ros.Subscriber(topic, std_msgs.msg.String, callback)
         mouth.send_to(topic, typed_as=STRING, data='x')
-    queues = node._current_run.callback_order.queues
+    queues = node._current_run.callback_queue.order.queues
     until(lambda: order or gate.heard and any(map(waits_for_turn, list(queues))))
     gate.open.set()
     until(lambda: len(order) == 2)

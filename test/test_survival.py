@@ -3,7 +3,6 @@ import collections
 import concurrent.futures
 import contextlib
 import errno
-import functools
 import itertools
 import os
 import re
@@ -620,15 +619,16 @@ def test_refused_connection_is_tried_again(node, peer):
 
 
 def test_publisher_that_has_left_is_not_connected_again(node, monkeypatch, peer):
-    attempts, run = [], node._current_run
+    attempts = []
     peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
     channel = node.interested_in('/words', STRING)
     until(lambda: channel.connections)
     start = 'pharos.private_rospy.connections._start_connecting'
     monkeypatch.setattr(start, lambda *arguments: attempts.append(arguments))
     peer.run('out.unregister()')
-    until(lambda: run.retries)
-    until(lambda: not run.retries)
+    subscription = node._current_run.topic_manager.subs['/words']
+    until(lambda: subscription.retries)
+    until(lambda: not subscription.retries)
     assert not attempts
 
 
@@ -911,10 +911,15 @@ def test_watcher_outlives_a_full_disk(mortal):
         program.wait()
 
 
+def prepare_retries(run):
+    run.node.interested_in('/heard', STRING)
+    run.topic_manager.subs['/heard'].retries = collections.UserDict()
+
+
 LOOKED_AT = {
     'connections': ('topic_manager.check_all', lambda run: None),
     'log': ('ros.logwarn_throttle_identical', lambda run: run.troubles.add('a trouble')),
-    'retries': ('retries.items', lambda run: setattr(run, 'retries', collections.UserDict())),
+    'retries': ('topic_manager.subs./heard.retries.items', prepare_retries),
     'silent clients': (
         'deadlines.items',
         lambda run: setattr(run, 'deadlines', collections.UserDict()),
@@ -928,14 +933,16 @@ def break_look(monkeypatch, run, what):
     """Have a call of the watcher's look at a run raise; return the list of those calls."""
     path, prepare = LOOKED_AT[what]
     prepare(run)
-    owner, _, name = path.rpartition('.')
-    calls = []
+    *names, name = path.split('.')
+    owner, calls = run, []
+    for each in names:
+        owner = owner[each] if isinstance(owner, dict) else getattr(owner, each)
 
     def fail(*arguments):
         calls.append(arguments)
         raise RuntimeError('this look fails')
 
-    monkeypatch.setattr(functools.reduce(getattr, filter(None, owner.split('.')), run), name, fail)
+    monkeypatch.setattr(owner, name, fail)
     return calls
 
 

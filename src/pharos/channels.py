@@ -37,7 +37,8 @@ class Endpoint:
     start opens the endpoint again, unless the node's class has a start() of its own.
 
     :ivar node: the node
-    :ivar closed: True if the endpoint was closed, or the node is stopped
+    :ivar closed: True if the endpoint was closed, or the node is stopped. open() and close() set it;
+        Run.mark_stopped() does so for all endpoints, and InputChannel._open() early, for the first message
     """
 
     node: Node
@@ -63,7 +64,8 @@ class Endpoint:
 
         :raises MasterUnreachableError: if the master does not answer
         """
-        if not self._open():
+        is_closed_again = self._open()
+        if not is_closed_again:
             self._run.endpoints.append(self)  # in place: another thread may open or close one, too
             self.closed = False
 
@@ -211,7 +213,8 @@ class OutputChannel(Channel):
         # asked before: later subscribers learn of this publisher from the master
         subscribers = set(self._run.master.system_state()[1].get(self.topic, []))
         latched = None
-        if self.ros_object:  # the node was stopped, and starts again: its latched message stays
+        # the node starts again: _publisher is still that of the run before, which has its latched message
+        if self.ros_object:
             latched = self._publisher.latches.get(self)
         super().open()
         if latched is not None:

@@ -128,7 +128,7 @@ class Node(DelegateHolder):
         self._send_lock = threading.Lock()  # held while send_to() opens a channel
         # (topic, type) as given to send_to -> OutputChannel
         self._send_channels: dict[tuple, OutputChannel] = {}
-        # for users: their class may give these names another meaning, so _settings has what holds
+        # for users alone, whose class may give these names another meaning: this package reads _settings
         self.name = settings.name
         self.master = settings.master
         self.domain = settings.domain
@@ -195,7 +195,8 @@ class Node(DelegateHolder):
         """End the souls, send messages under way, unregister, free ports and threads.
 
         Do nothing if the node is stopped. Wait up to :attr:`stop_timeout` for souls, then for the
-        delegate that runs, then for messages. The log names souls that go on after that.
+        delegate that runs, then for messages. The log names souls that go on after that. In a soul or
+        delegate, return at once if a stop goes on already: that one waits for this thread.
         """
         run = self._current_run
         if (
@@ -297,7 +298,10 @@ class Node(DelegateHolder):
 
     @property
     def is_running(self) -> bool:
-        """True if the node has started, and no stop has begun."""
+        """True if the node has started, and no stop has begun.
+
+        A stop that a signal has broken off leaves it True: the node's next stop is the signal's own.
+        """
         return self.lifecycle is Lifecycle.RUNNING
 
     @property
@@ -395,6 +399,7 @@ class Node(DelegateHolder):
         former = current.node, current.run
         current.node = self
         current.run = run
+        # a retry runs the soul that the node has then; a block of fork() is run again itself
         is_node_soul = block is self.soul
 
         def retry(message: None) -> None:
@@ -475,7 +480,7 @@ class Node(DelegateHolder):
         run = self._current_run
         if run and run.is_active:
             # called from here, not from a helper: rospy logs the caller of this method
-            run.core._base_logger('%s', (text,), {}, level=level)
+            run.ros.core._base_logger('%s', (text,), {}, level=level)
         else:
             Transcript.show(f'[{level.upper()}] {self._settings.name}: {text}')
 

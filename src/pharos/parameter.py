@@ -20,6 +20,7 @@ class Parameter(Endpoint):
         self.name = name
         self.delegate = []
         self._value = initialized
+        # held from a read to its entry in _changes: they are in the order of the reads
         self._read_lock = threading.Lock()
         # the values that the blocks have not got yet
         self._changes: collections.deque = collections.deque()

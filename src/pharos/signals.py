@@ -45,7 +45,8 @@ class QuietWait:
     """Ends the wait in a ``with`` without an exception if a node stops or a signal stops all nodes.
 
     Other KeyboardInterrupts and SystemExits go on. (contextlib.contextmanager would raise a
-    RuntimeError for a signal that comes before its ``yield``.)
+    RuntimeError for a signal that comes before its ``yield``.) Who waits then looks for the stop:
+    sleep() and every() at the run's ``stopping``; spin() stops all nodes.
     """
 
     def __enter__(self) -> None:

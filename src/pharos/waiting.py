@@ -13,8 +13,9 @@ NOTICE_DELAY = 3.0  # seconds
 
 
 class _Current(threading.local):
-    """The node with its soul or its program in this thread, and the run of the soul, or None.
+    """The node with its soul or its program in this thread, and their run, or None.
 
+    :ivar run: a soul that a restart has left behind keeps its own run, which has stopped
     :ivar service_run: the run whose service this thread answers, or None
     """
 

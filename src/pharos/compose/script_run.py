@@ -250,10 +250,9 @@ class ScriptRun(Run):
         url = get_master_uri(self.environ, self.argv)
         master = type(self.master)(url, self.master.shared_memory, self.master.share_connections)
         if master != self.master:
-            self.master = settings.master = self.node.master = master
+            settings.master = self.node.master = master
         self.base_name = load_mappings(self.argv).get('__name', name)
-        self.name = ns_join(get_ros_namespace(self.environ, self.argv), self.base_name)
-        settings.name = self.name
+        settings.name = ns_join(get_ros_namespace(self.environ, self.argv), self.base_name)
         self.node.name = self.name
         settings.ports = options.pop('tcpros_port', 0), options.pop('xmlrpc_port', 0)
         for parameter_name, value in self.node.params.items():
@@ -343,7 +342,7 @@ class ScriptRun(Run):
             os._exit(status)  # a child by os.fork()
         self.exit_request = SystemExit(status)
         for functions in (
-            self.core._client_shutdown_hooks,
+            self.ros.core._client_shutdown_hooks,
             self.exit_functions,
             self.thread_exit_functions,
             self.threads_to_join,
@@ -418,7 +417,7 @@ class ScriptRun(Run):
 
     def _signal_numbers(self) -> list[int]:
         """Return [SIGINT], and SIGTERM if the program has a handler of its own for that alone."""
-        defaults = signal.default_int_handler, self.core._ros_signal
+        defaults = signal.default_int_handler, self.ros.core._ros_signal
         handler = self._handler_of(signal.SIGTERM)
         is_own = callable(handler) and handler not in defaults
         if is_own and self._handler_of(signal.SIGINT) in defaults:
@@ -473,7 +472,7 @@ class ScriptRun(Run):
         if self.has_run_hooks:
             return
         self.has_run_hooks = True
-        self._run_all(self.core._client_shutdown_hooks, 0)
+        self._run_all(self.ros.core._client_shutdown_hooks, 0)
         self.close_rospy(STOP_LIMIT)
 
     def stop_created_nodes(self) -> None:

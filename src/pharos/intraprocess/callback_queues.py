@@ -28,8 +28,8 @@ TURN_LIMIT = 0.05  # seconds that a callback waits at most, also for those that 
 class CallbackOrder:
     """The order of the callbacks of one node.
 
-    Each message gets a number when it reaches the node. A queue has its turn if no other one with a
-    lower number delays it.
+    Each message gets a number when it reaches the node. A queue has its turn if no other one delays
+    it: by a message with a lower number that waits, or by a callback that runs.
 
     :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
         has no more threads
@@ -66,8 +66,9 @@ class CallbackOrder:
 class CallbackQueue:
     """Runs callbacks one at a time: a node's delegates, or those of a subscription of plain rospy.
 
-    The thread starts with the first message, and ends with the queue. Objects bound to their thread
-    (a connection of SQLite, a context of CUDA) keep working, unless a channel of the node is inline.
+    The thread starts with the first message that no publisher runs inline, and ends with the queue.
+    Objects bound to their thread (a connection of SQLite, a context of CUDA) keep working, unless a
+    channel of the node is inline.
 
     :param order: the CallbackOrder of the node
     :param first_pause: seconds until the first callback, unless release() ends the pause before. A
@@ -83,7 +84,8 @@ class CallbackQueue:
     closed = False
     running_thread = None
     begin_time: float | None = None
-    _was_slow = False  # True if the last callback took longer than SLOW
+    # True if the last callback took longer than SLOW; stays as it was while the node has one queue
+    _was_slow = False
     thread = None
 
     def __init__(self, order: CallbackOrder, first_pause: float = 0.0) -> None:
@@ -157,6 +159,8 @@ class CallbackQueue:
     def run_jobs(self, in_turn: bool = True) -> None:
         """Run all jobs in this thread, unless another thread does so already, or the first pause goes on.
 
+        Of two threads that come at one moment, one waits, and runs what the other has left.
+
         :param in_turn: False: begin at once, whatever other queues of the node do
         """
         jobs = self.jobs
@@ -164,7 +168,8 @@ class CallbackQueue:
         if self.pause_end:
             self.request_thread()
             return
-        # the outer loop: a publisher that adds a job before the release finds the lock taken
+        # the outer loop: a publisher that adds a job after the inner one, before the release, finds the
+        # lock taken, and leaves the job to this thread
         while jobs and not self.closed and not self._running_lock.locked():
             with self._running_lock:  # in C: the handler of a signal cannot raise in between
                 self.running_thread = get_ident()
@@ -300,21 +305,20 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     """Wake the threads of some callback queues; a publisher calls this.
 
     :param last_wake: what the last call for the same publisher has returned
-    :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
-        wait for no other
+    :param may_wait: True: then wait until each thread begins to look for messages, up to YIELD_LIMIT;
+        after one that takes so long, since it is in a callback, wait for no other
     :returns: the time of the last wake, as of perf_counter(). After a wait that took so long it is
         YIELD_PAUSE later, and the publisher waits for no thread before that
     """
     now = time.perf_counter()
-    # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
-    waits = may_wait and now - last_wake > BURST
-    for callback_queue in callback_queues:
-        if not callback_queue.request_thread():
-            continue
-        # _loop() frees the lock
-        if waits and not callback_queue.request_lock.acquire(True, YIELD_LIMIT):
-            waits = False
-            last_wake = now + YIELD_PAUSE
-        # after the wait: to wait is no rest of the publisher
-        last_wake = max(last_wake, time.perf_counter())
-    return last_wake
+    woken_queues = [each for each in callback_queues if each.request_thread()]
+    if not woken_queues:
+        return last_wake
+    # a busy publisher keeps the interpreter for 5 ms, unless it waits for the threads to run
+    if may_wait and now - last_wake > BURST:
+        for callback_queue in woken_queues:
+            # _loop() frees the lock
+            if not callback_queue.request_lock.acquire(True, YIELD_LIMIT):
+                return now + YIELD_PAUSE
+    # after the wait: to wait is no rest of the publisher
+    return max(last_wake, time.perf_counter())

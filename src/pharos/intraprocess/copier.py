@@ -165,22 +165,22 @@ _GLOBALS.update(
 class _Source:
     """The lines of ``freeze`` and ``thaw`` for one class. In them, ``m`` is the message.
 
-    :param depth: 0 for a message of its own, which is checked and has its times made canonical;
-        more for a nested message or an element of an array
+    :param is_whole: True for a message of its own, which is checked and has its times made canonical;
+        False for a nested message or an element of an array
     :ivar namespace: the names that the functions use -> their values
     :ivar freeze_lines: read the fields into variables
     :ivar thaw_lines: set the fields of a new message
     :ivar variables: the parts of a frozen message
     """
 
-    def __init__(self, cls: type[genpy.Message], depth: int) -> None:
+    def __init__(self, cls: type[genpy.Message], is_whole: bool) -> None:
         self.namespace: dict[str, Any] = dict(_GLOBALS)
         self.freeze_lines = []
         self.thaw_lines = []
         self.variables = []
         self._numbers = []  # (base type, field, variable) of single numbers
         self._counter = itertools.count()
-        self._add_fields(cls, 'm', depth)
+        self._add_fields(cls, 'm', is_whole)
         if self._numbers:
             self._pack_numbers()
 
@@ -199,7 +199,7 @@ class _Source:
         self.namespace['unpack'] = struct.Struct(f'<{received_codes}').unpack
         self.freeze_lines.append(f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))')
 
-    def _add_fields(self, cls: type[genpy.Message], owner: str, depth: int) -> None:
+    def _add_fields(self, cls: type[genpy.Message], owner: str, is_whole: bool) -> None:
         if cls in _TIMES.values():
             base = 'uint32' if cls is genpy.Time else 'int32'
             fields = [('secs', base), ('nsecs', base)]
@@ -208,19 +208,21 @@ class _Source:
         else:
             raise _UnusualError
         for name, type_name in fields:
-            self._add_field(cls, f'{owner}.{name}', type_name, depth)
+            self._add_field(cls, f'{owner}.{name}', type_name, is_whole)
 
-    def _add_field(self, cls: type[genpy.Message], field: str, type_name: str, depth: int) -> None:
+    def _add_field(
+        self, cls: type[genpy.Message], field: str, type_name: str, is_whole: bool
+    ) -> None:
         base, is_array, length = parse_type(type_name)
         variable = f'v{next(self._counter)}'
         is_nested = base not in CODES and base != 'string'
         if is_nested and not is_array:
-            self._add_message(nested_class(base, cls), field, variable, depth)
+            self._add_message(nested_class(base, cls), field, variable, is_whole)
             return
         self.variables.append(variable)
         new_value = variable
         if is_nested:
-            freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), 1))  # type: ignore
+            freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), False))  # type: ignore
             # not tuple(map(...)): gc.get_objects() of another thread makes Python raise a SystemError
             self.freeze_lines.append(f'{variable} = tuple([*map({freeze}, sequence({field}))])')
             new_value = f'list(map({thaw}, {variable}))'
@@ -236,12 +238,14 @@ class _Source:
             self.freeze_lines.append(f'if len({variable}) != {length}: raise Unusual')
         self.thaw_lines.append(f'{field} = {new_value}')
 
-    def _add_message(self, cls: type[genpy.Message], field: str, variable: str, depth: int) -> None:
+    def _add_message(
+        self, cls: type[genpy.Message], field: str, variable: str, is_whole: bool
+    ) -> None:
         """Add the fields of a nested message."""
         self.freeze_lines.append(f'{variable} = {field}')
         self.thaw_lines.append(f'{variable} = {field} = new({self.name_for(cls)})')
-        self._add_fields(cls, variable, depth + 1)
-        if depth == 0 and cls in _TIMES.values():  # genpy canonizes top-level fields alone
+        self._add_fields(cls, variable, False)
+        if is_whole and cls in _TIMES.values():  # genpy canonizes top-level fields alone
             self.thaw_lines.append(f'{variable}.canon()')
 
 
@@ -260,13 +264,13 @@ def nested_class(base: str, cls: type[genpy.Message]) -> type[genpy.Message]:
 
 
 @functools.lru_cache(None)
-def _generate(cls: type[genpy.Message], depth: int = 0) -> tuple[Callable, Callable]:
-    """Return ``freeze`` and ``thaw`` for a class; depth 1 is an element of an array."""
-    source = _Source(cls, depth)
+def _generate(cls: type[genpy.Message], is_whole: bool = True) -> tuple[Callable, Callable]:
+    """Return ``freeze`` and ``thaw`` for a class; those of an element of an array are not whole."""
+    source = _Source(cls, is_whole)
     class_name = source.name_for(cls)
     variables = ''.join(f'{variable}, ' for variable in source.variables)
     freeze_lines = [*source.freeze_lines, f'return ({variables})']
-    if depth == 0:  # an element of an array may be of a similar class
+    if is_whole:  # an element of an array may be of a similar class
         freeze_lines = [
             f'if m.__class__ is not {class_name}: return serialize(m)',
             'try:',

@@ -15,10 +15,10 @@ class BoundedQueue:
     """Messages that wait; a full queue drops the oldest.
 
     ``queue_size`` is the number of messages that wait at most. 0: as many as ``queue_bytes`` hold.
-    None is the same as 0 within a process, and by shared memory. By TCPROS, None means no queue, as
-    in rospy: publish() waits for the socket. A subscription of plain rospy without a queue_size
-    reads no more messages until its callbacks have ended, unless its connection is shared: whoever
-    reads for several nodes waits for none.
+    None is the same as 0 within a process (PlainInbox has more), and by shared memory. By TCPROS,
+    None means no queue, as in rospy: publish() waits for the socket. A subscription of plain rospy
+    without a queue_size reads no more messages until its callbacks have ended, unless its connection
+    is shared: whoever reads for several nodes waits for none.
 
     :ivar messages: the messages that wait, the oldest first
     :ivar dropped: the number of dropped messages
@@ -55,7 +55,7 @@ class BoundedQueue:
             self.dropped += number
 
     def forget(self, message: Any) -> bool:
-        """Free what a dropped message holds; return False if it is not dropped after all."""
+        """Free what a message holds; return True if it was dropped, False if its receiver has taken it."""
         return True
 
 
@@ -80,7 +80,9 @@ class Inbox(BoundedQueue):
         self.callback = callback
         self.inline = inline
         self.shared = shared
-        self._capacity = math.inf
+        self._capacity = (
+            math.inf
+        )  # the last answer of capacity_for(): if full, and at powers of two
         if callback_queue:  # a channel attaches when it opens
             self.attach(callback_queue)
 

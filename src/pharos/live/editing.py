@@ -79,7 +79,9 @@ def reload(node):
         sys.setswitchinterval(interval)
     for failure in node._current_run.failures:
         if isinstance(failure.block, str) and not isinstance(failure.error, PharosError):
-            notes.append(f'{failure.block} has ended: {failure.error!r}; restart {node.name}')
+            notes.append(
+                f'{failure.block} has ended: {failure.error!r}; restart {node._settings.name}'
+            )
     return '\n'.join(notes) or NO_CHANGE
 
 
@@ -96,7 +98,7 @@ def _parse(file):
 
 def _failure(file, line, error):
     text = ''.join(traceback.format_exception_only(type(error), error)).strip()
-    return PharosError(f'{file}:{line}: {text}; {NO_CHANGE}')
+    return PharosError(f'{file}:{line}: {text}; no function, class or value has changed')
 
 
 def _read(module, tree, notes, undo):

@@ -11,7 +11,7 @@ from typing import Any
 
 def facts_of(run: Any) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health`, but for the master's."""
-    queues = list(run.callback_order.queues)
+    queues = list(run.callback_queue.order.queues)
     # read once: a callback may end meanwhile
     begin_times = [queue.begin_time for queue in queues]
     begin_times = [begin_time for begin_time in begin_times if begin_time]

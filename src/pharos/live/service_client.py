@@ -30,7 +30,8 @@ from pharos.waiting import current
 LOOK_UP_LIMIT = 0.25  # seconds that the constructor waits for the type; call() asks again
 TYPE_LIMIT = 5.0  # seconds that a call without a timeout waits for the type
 
-ignores_timeout = False  # True in virtual time, which does not go by while a socket is waited for
+# set by simulation: virtual time does not go by while a socket is waited for
+ignores_timeout = False
 
 
 class Service:

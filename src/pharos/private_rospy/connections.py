@@ -87,7 +87,7 @@ def register(run, registry, name, data):
             _REGISTER_METHODS[registry], name, data, run.uri, caller_id=run.name
         )
         if registry == 'sub' and publishers is not None:
-            run.publisher_uris[name] = publishers
+            run.topic_manager.subs[name].publisher_uris = publishers
     if registry == 'pub':
         connect_subscribers(run, name)
 
@@ -95,93 +95,95 @@ def register(run, registry, name, data):
 def connect_subscribers(run, topic):
     """Have all nodes of this process connect to a new publisher: sooner than by the master's call."""
     for subscriber in list(runs.values()):
-        if subscriber.master.url == run.master.url:
-            _connect(subscriber, topic, run.uri)
+        subscription = subscriber.topic_manager.subs.get(topic)
+        if subscription and subscriber.master.url == run.master.url:
+            _connect(subscription, run.uri)
 
 
-def connect_all(run, topic):
-    """Connect to the publishers of a topic, from the last list of the master.
+def connect_all(subscription):
+    """Connect a subscription to its publishers, from the last list of the master.
 
     Link those of this process in this thread, and connect to others in threads.
     """
-    for uri in run.publisher_uris.get(topic, ()):
+    for uri in subscription.publisher_uris:
         if uri in runs:
-            _connect(run, topic, uri)
+            _connect(subscription, uri)
         else:
-            _start_connecting(run, topic, uri)
+            _start_connecting(subscription, uri)
 
 
-def _connect(run, topic, uri):
-    """Connect the subscription of a topic to a publisher, by a link or a socket.
+def _connect(subscription, uri):
+    """Connect a subscription to a publisher, by a link or a socket.
 
     Do nothing if they are connected, or if another thread connects them already.
 
     :param uri: the URI of the publisher's node
     """
-    subscription = run.topic_manager.subs.get(topic)
-    if run.stopping.is_set() or not subscription or subscription.has_connection(uri):
+    run = subscription.run
+    if run.stopping.is_set() or subscription.closed or subscription.has_connection(uri):
         return
-    key = topic, uri, id(subscription)  # a closed one may still connect
     this_attempt = object()
-    if run.connecting.setdefault(key, this_attempt) is not this_attempt:
+    if subscription.attempts.setdefault(uri, this_attempt) is not this_attempt:
         return
     try:
         publisher_run = runs.get(uri)
         share = share_of(subscription, uri)
         if publisher_run:
-            link_topic(publisher_run, run, topic)
+            link_topic(publisher_run, run, subscription.resolved_name)
         elif share:
             with share.lock:  # one connects, and the others join
                 if not share.join(subscription):
-                    _negotiate(run, topic, uri, subscription)
+                    _negotiate(subscription, uri)
         else:
-            _negotiate(run, topic, uri, subscription)
+            _negotiate(subscription, uri)
     except Exception as error:  # told by the watcher, which tries again
-        connect_later(run, topic, uri, repr(error))
+        connect_later(subscription, uri, repr(error))
     finally:
-        del run.connecting[key]
+        del subscription.attempts[uri]
 
 
-def _negotiate(run, topic, uri, subscription):
+def _negotiate(subscription, uri):
     """Have rospy offer the protocols of Run.make_findable() and TCPROS, and connect by one."""
     try:
-        code, _, _ = run.ros_handler._connect_topic(topic, uri)
+        code, _, _ = subscription.run.ros_handler._connect_topic(subscription.resolved_name, uri)
     except (AttributeError, UnboundLocalError):
         return  # rospy raises these if the subscription is closed meanwhile
     except RuntimeError as error:  # no thread is left, but rospy has added the connection
         for connection in subscription.connections:
             if connection.endpoint_id == uri:
                 subscription.remove_connection(connection)
-        connect_later(run, topic, uri, str(error))
+        connect_later(subscription, uri, str(error))
         return
     if code != 1:
-        connect_later(run, topic, uri)
+        connect_later(subscription, uri)
 
 
-def connect_later(run, topic, uri, reason=''):
+def connect_later(subscription, uri, reason=''):
     """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
 
     :param reason: the text of the last error, for the log, or ''
     """
-    run.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
+    subscription.retries[uri] = monotonic() + RETRY_DELAY, reason
 
 
 def _retry_connections(run):
-    for (topic, uri), (retry_time, reason) in list(run.retries.items()):
-        if monotonic() < retry_time:
-            continue
-        del run.retries[topic, uri]
-        if uri not in run.publisher_uris.get(topic, ()):
-            continue
-        if reason:
-            run.troubles.add(f'{topic}: no connection to {uri}, it is tried again: {reason}')
-        _start_connecting(run, topic, uri)
+    for subscription in list(run.topic_manager.subs.values()):
+        for uri, (retry_time, reason) in list(subscription.retries.items()):
+            if monotonic() < retry_time:
+                continue
+            del subscription.retries[uri]
+            if uri not in subscription.publisher_uris:
+                continue
+            if reason:
+                topic = subscription.resolved_name
+                run.troubles.add(f'{topic}: no connection to {uri}, it is tried again: {reason}')
+            _start_connecting(subscription, uri)
 
 
-def _start_connecting(run, topic, uri):
+def _start_connecting(subscription, uri):
     """Connect in a thread, or later if the system has none left."""
-    if not run.start_thread(functools.partial(_connect, run, topic, uri)):
-        connect_later(run, topic, uri)
+    if not subscription.run.start_thread(functools.partial(_connect, subscription, uri)):
+        connect_later(subscription, uri)
 
 
 # -- the watcher
@@ -207,7 +209,7 @@ def _check_peers(run):
 
 def _start_threads(run):
     """Start the threads of callback queues that the system had no thread for."""
-    for queue in list(run.callback_order.queues):
+    for queue in list(run.callback_queue.order.queues):
         if not queue.thread:
             queue.request_thread()
 
@@ -296,7 +298,8 @@ def _register_missing(run, entries, state):
             # not if a namesake of another process has the name now: the master ends this node
             if run.master.call('lookupNode', run.name) in (None, run.uri):
                 register(run, registry, name, data)
-                connect_all(run, name)
+                if registry == 'sub':
+                    connect_all(run.topic_manager.subs[name])
     if not registered and not run.stopping.is_set():  # this is a new master
         # all values before any is set or reported: each such time all of them are read
         for parameter in run.node._parameters:

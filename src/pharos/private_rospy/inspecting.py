@@ -13,7 +13,8 @@ from pharos.private_rospy.loader import PrivateModules
 def private_module(thing):
     """Return the private module of a class, function, method or frame, or None.
 
-    That of a class is one of the node whose code has called.
+    A class has only the name of its module, the same in all nodes: its module is that of the node
+    whose code has called.
     """
     owner = None
     if inspect.isclass(thing):

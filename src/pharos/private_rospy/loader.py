@@ -218,6 +218,9 @@ class PrivateModules:
         names rospy, or imports what does           private
         in a folder that the script has added       private
         all others                                  shared
+
+        The first question for a module of a site-packages folder that only the script has puts that
+        folder into the process's sys.path.
         """
         top_name = name.partition('.')[0]
         if _is_generated(name):
@@ -256,6 +259,7 @@ class PrivateModules:
         :raises ModuleNotFoundError: if there is no such module
         """
         parent, _, leaf = name.rpartition('.')
+        # without the lock: a known name needs no rule, and may still be loading. Then the lock waits
         if name not in self.by_name and not self._is_private(name):
             module = _import_shared(name)
             if parent and self._is_private(parent):  # a package with code and messages

@@ -3,7 +3,8 @@
 Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
 target. ``original`` is the former function, and ``run`` the Run that owns the private module. Over
 ``def f(original, run)``, ``@replace(module, target)`` puts the returned object in the target's
-place. Each docstring names first the behaviour of rospy, then that of the patch ("this").
+place. Each docstring names the fault of rospy, of another library or of the master, then what the patch
+does ("this").
 """
 from __future__ import annotations
 
@@ -149,7 +150,9 @@ def no_delay(original: Callable, run: Run, sock: socket.socket, is_tcp_nodelay: 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
 def start_xmlrpc(original: Callable, run: Run, self: Any) -> None:
     """rospy binds the port in another thread, and prints an error. This binds here, and raises."""
-    original.__globals__['print'] = lambda text: None
+    original.__globals__[
+        'print'
+    ] = lambda text: None  # _run_init() prints an error that it also raises
     self._run_init()
     server = self.server
 
@@ -319,7 +322,7 @@ def subscribe(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any
     """rospy connects before the callback is there. This connects after, as add_callback() does."""
     original(self, *args, **kwargs)
     if self.callback is None:  # otherwise add_callback() has connected
-        connections.connect_all(run, self.resolved_name)
+        connections.connect_all(self.impl)
 
 
 @patch('rospy.topics', 'QueuedConnection')
@@ -364,11 +367,12 @@ def publisher_update(original: Callable, run: Run, self: Any, name: str, uris: l
 
     This connects to all at the first call.
     """
-    # publishers_changed() below has forgotten the list: the first call finds none, and the further
-    # ones find this very list
-    if uris != run.publisher_uris.get(name):
-        run.publisher_uris[name] = uris
-        connections.connect_all(run, name)
+    # publishers_changed() below has forgotten the list: the first call finds none; the further ones
+    # find an equal one, and do nothing
+    subscription = run.topic_manager.subs.get(name)
+    if subscription and uris != subscription.publisher_uris:
+        subscription.publisher_uris = uris
+        connections.connect_all(subscription)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
@@ -378,8 +382,9 @@ def publishers_changed(original: Callable, run: Run, self: Any, *args: Any) -> t
     rospy then calls publisher_update() above, unless the list is empty.
     """
     if len(args) > 1:  # rospy refuses a call with too few arguments
-        topic = args[1]
-        run.publisher_uris.pop(topic, None)
+        subscription = run.topic_manager.subs.get(args[1])
+        if subscription:
+            subscription.publisher_uris = []
     return original(self, *args)
 
 
@@ -404,7 +409,7 @@ def send_goal(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any
     No callback that waits for its turn begins meanwhile, for TURN_LIMIT at most: the feedback stays
     before the result.
     """
-    order = run.callback_order
+    order = run.callback_queue.order
     order.is_paused = True
     try:
         original(self, *args, **kwargs)

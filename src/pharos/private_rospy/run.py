@@ -90,12 +90,12 @@ class Run:
     lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
     rospy_signal_shutdown: Callable
+    Thread: type[threading.Thread]  # made by substitutes()
+    ros_handler: Any
 
     def __init__(self, node: Node, settings: Settings) -> None:
         self.node = node
         self.settings = settings
-        self.name = settings.name
-        self.master = settings.master
         self.failures = Failures()
         # thread that runs -> its block, None for the node's soul, and True if it is required
         self.souls: dict[threading.Thread, tuple[Any, bool]] = {}
@@ -112,14 +112,8 @@ class Run:
         self.calls: WeakSet[socket.socket] = WeakSet()  # sockets of calls of services
         # socket of a silent client -> the time when it is closed
         self.deadlines: dict[socket.socket, float] = {}
-        self.publisher_uris: dict[str, list[str]] = {}  # topic -> URIs, the last list of the master
-        # (topic, URI) -> the time to connect again, and the last error
-        self.retries: dict[tuple[str, str], tuple[float, str]] = {}
-        # (topic, URI, id of the subscription) -> an object of the attempt that goes on
-        self.connecting: dict[tuple[str, str, int], object] = {}
-        self.callback_order = CallbackOrder(self.start_thread)
         # the pause ends when the node's start() has returned
-        self.callback_queue = CallbackQueue(self.callback_order, HOLD_LIMIT)
+        self.callback_queue = CallbackQueue(CallbackOrder(self.start_thread), HOLD_LIMIT)
         namespace, _, self.base_name = self.name.rpartition('/')
         self.clock_deadline = time.monotonic() + CLOCK_LIMIT  # when a clock that stands is told
         self.environ = {
@@ -136,7 +130,6 @@ class Run:
         patch = functools.partial(patches.apply, run=self)
         self.modules = PrivateModules(self.substitutes(), patch)
         self.ros: Any = self.modules.load('rospy')
-        self.core = self.ros.core
         registration = self.ros.impl.registration
         self.topic_manager: Any = registration.get_topic_manager()
         self.service_manager: Any = registration.get_service_manager()
@@ -146,15 +139,16 @@ class Run:
 
         Make :attr:`Thread`, the class of the node's threads.
         """
-        run = self
+        owner = self
 
         class Thread(threading.Thread):
             """A daemon thread of the node; the node's stop waits for its end."""
 
             def start(self) -> None:
                 self.daemon = True
-                run.threads.add(self)  # before its start: a stop waits for it
-                self.run = functools.partial(run.run_thread, self, self.run)  # type: ignore
+                owner.threads.add(self)  # before its start: a stop waits for it
+                # Python calls self.run() in the thread: here run_thread(), which calls the former one
+                self.run = functools.partial(owner.run_thread, self, self.run)  # type: ignore
                 super().start()
 
         self.Thread = Thread
@@ -230,6 +224,16 @@ class Run:
         self.request_stop()
 
     # -- state
+
+    @property
+    def name(self) -> str:
+        """The node's full name."""
+        return self.settings.name
+
+    @property
+    def master(self) -> Master:
+        """The node's Master."""
+        return self.settings.master
 
     @property
     def is_active(self) -> bool:
@@ -331,7 +335,8 @@ class Run:
         tcpros_base = self.ros.impl.tcpros_base
         tcp_port, xmlrpc_port = self.settings.ports
         try:
-            # rospy's own start finds this server, and makes none: rospy does not report a busy port
+            # a global of the node's rospy keeps the server: init_node() finds it there, and makes none.
+            # rospy does not report a busy port
             server = tcpros_base.init_tcpros_server(tcp_port)
             tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, tcp_port)
             server.tcp_ros_server = tcp_server

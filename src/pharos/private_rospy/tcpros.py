@@ -92,7 +92,7 @@ def end_connection(subscription, connection, uri, reason):
     if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
         subscription.run.report_refusal(topic, reason)
     elif not subscription.closed:
-        connect_later(subscription.run, topic, uri, reason)
+        connect_later(subscription, uri, reason)
 
 
 def _receive(connection, subscription):
@@ -187,7 +187,8 @@ class Sender(BoundedQueue):
         self._publication = publication
         super().__init__()  # its messages are lists of parts
         self.queue_bytes = publication.run.node.queue_bytes
-        self._unsent = [], []  # the parts of a message, and the numbers of bytes sent of them
+        # the parts of a message, and the numbers of bytes sent of them, which _send() adds to in C
+        self._unsent = [], []
         # for `with`: in C, since the handler of a signal may raise between any two lines of Python
         self._lock = threading.RLock()
 

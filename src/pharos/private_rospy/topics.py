@@ -46,13 +46,14 @@ class PublisherOverlay:
     def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
-        # channel, or None for all Publishers of plain rospy -> frozen message. A new connection gets
-        # them by add_connection(), a new link by link_topic(), a new callback by add_callback()
+        # channel, or None for all Publishers of plain rospy -> frozen message. add_connection(),
+        # link_topic() and add_callback() hand them to what is new, OutputChannel.open() its own to the
+        # next run; its close() drops it
         self.latches = {}
         self.last_wake = 0.0
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
-        self.header = None
+        self.header = None  # for links and shared memory, by make_header(); ``headers`` is rospy's
         self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
         # None: find them anew. rospy makes a new list of connections at each change
         self.receivers: Receivers | None = None
@@ -155,14 +156,14 @@ class PublisherOverlay:
                 message.header.seq = self.seq
                 if message.header.frame_id is None:
                     message.header.frame_id = '0'
-            # links need a frozen message, and latches; if nobody receives, a channel has it checked
-            if inboxes_by_thaw or is_latched or channel and not others:
+            needs_check = channel and not others  # nobody serializes the message of a channel
+            if inboxes_by_thaw or is_latched or needs_check:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
                 for thaw, inboxes in inboxes_by_thaw.items():
                     item = frozen, thaw, self.header
-                    for inbox in inboxes:
+                    for inbox in inboxes:  # without thaw: the message itself, as from a socket
                         inbox.put((message, None, None) if inbox.shared else item)
             if others:
                 self.write(message, others)
@@ -238,7 +239,7 @@ class PlainInbox(Inbox):
     """The messages that wait for a subscription's callbacks of plain rospy; all share one Inbox."""
 
     def __init__(self, subscription: Any, first_pause: float) -> None:
-        callback_queue = CallbackQueue(subscription.run.callback_order, first_pause)
+        callback_queue = CallbackQueue(subscription.run.callback_queue.order, first_pause)
         super().__init__(callback_queue, subscription.call_plain, subscription.queue_size)
         self.subscription = subscription
         self.queue_bytes = subscription.run.node.queue_bytes
@@ -259,6 +260,7 @@ class PlainInbox(Inbox):
                 self.put((message, None, None), size)
                 self.callback_queue.run_jobs_here()
                 return
+            # the Reader reads for all connections, and runs no callback: it leaves this one until resume()
             connection.pause()
             self._paused_connections.append(connection)
         super().receive(message, size, connection)
@@ -291,12 +293,18 @@ class SubscriptionOverlay:
 
     :ivar run: as in PublisherOverlay
     :ivar inboxes: the inboxes of all callbacks; links share this very list
+    :ivar publisher_uris: the publishers in the last list of the master
+    :ivar retries: a dict: URI of a publisher -> the time to connect again, and the last error
+    :ivar attempts: a dict: URI of a publisher -> an object of the attempt to connect that goes on
     """
 
     def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
         self.tcp_nodelay = True  # else a publisher may hold a small message back for 40 ms
         self.inboxes = []
+        self.publisher_uris = []
+        self.retries = {}
+        self.attempts = {}
         self.is_leaving = False  # True once close() has begun: no shared connection may be joined
         self.plain_inbox = None  # type: Any
 
@@ -372,7 +380,8 @@ class SubscriptionOverlay:
                 self._invoke_plain(callback, args, message)
 
     def _invoke_plain(self, callback: Callable, args: Any, message: Any) -> None:
-        with contextlib.suppress(SystemExit):  # would end the thread of the callbacks
+        # of sys.exit(), which would end the thread of the callbacks; a signal raises in the main thread
+        with contextlib.suppress(SystemExit):
             self._invoke_callback(message, callback, args)
 
     def add_callback(self, callback: Any, args: Any) -> None:
@@ -386,13 +395,14 @@ class SubscriptionOverlay:
             for frozen in list(link.publisher.latches.values()):
                 latch_inbox.put((frozen, link.thaw, link.header))
         latch_inbox.callback_queue.request_thread()
-        connect_all(self.run, self.resolved_name)
+        connect_all(self)
 
     def add_connection(self, connection: Any) -> bool:
-        share = share_of(self, connection.endpoint_id)
-        if not share or connection.transport_type != 'TCPROS':
-            return self.rospy_add_connection(connection)
-        return share.add(self, connection)  # _connect() has its lock
+        if connection.transport_type == 'TCPROS':
+            share = share_of(self, connection.endpoint_id)
+            if share:
+                return share.add(self, connection)  # _connect() has its lock
+        return self.rospy_add_connection(connection)
 
     def remove_callback(self, callback: Any, args: Any) -> None:
         self.rospy_remove_callback(callback, args)
@@ -401,7 +411,6 @@ class SubscriptionOverlay:
     def close(self) -> None:
         leave(self)
         close_topic(self)
-        self.run.publisher_uris.pop(self.resolved_name, None)
         if self.plain_inbox:
             self.plain_inbox.callback_queue.close(0)
 
@@ -409,7 +418,8 @@ class SubscriptionOverlay:
 def first_pause_for(callbacks: Iterable[tuple]) -> float:
     """Return how many seconds some callbacks must wait for the constructor that subscribes.
 
-    A function in C, and that of rospy's wait_for_message(), use nothing that a constructor sets.
+    A method in C, such as list.append, has the module None, and wait_for_message()'s callback is of
+    rospy.client: they use nothing that a constructor sets.
     """
     modules = {getattr(callback, '__module__', '') for callback, _ in callbacks}
     return 0.0 if modules <= {None, 'rospy.client'} else FIRST_PAUSE

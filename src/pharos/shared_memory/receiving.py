@@ -235,7 +235,7 @@ class Reader:
                     message = self.call(connection, connection.read)
                     if message:
                         messages.append(message)
-            timeout = 0
+            timeout = 0  # take what is there, and wait no more
         return messages
 
     def call(self, connection: MemoryReceiver, function):

@@ -186,7 +186,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
     """
 
     is_sending = False  # True while a thread sends the queue
-    is_broken = False
+    is_broken = False  # True from _break() on; close() follows once the memory's lock is free
     announced: MemoryFile | None = None  # the file that the reader has no receipt for yet
 
     def __init__(self, publisher, reader_name: str, sock: socket.socket) -> None:

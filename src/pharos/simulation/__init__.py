@@ -32,7 +32,8 @@ from pharos.simulation import stand_ins
 from pharos.simulation.stand_ins import PLAYER, local
 from pharos.waiting import wait
 
-#: nanoseconds that a look at a clock takes: programs divide by the time since their last look
+#: nanoseconds that a look at a clock takes: programs divide by the time since their last look. Those of
+#: stand_ins.FREE_LOOKS take none
 LOOK = 1000
 #: nanoseconds of looks after which a thread gives its turn back: it waits by looks
 LOOKS_LIMIT = 1_000_000
@@ -219,8 +220,8 @@ class Simulation:
     def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
         """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
 
-        :returns: the last value of ``predicate()``, which is called at first after 2 ms, later every 20 ms (with a
-            seed, a jitter later), in turn with the other threads
+        :returns: the last value of ``predicate()``, which is called at once, after 2 ms, 2.4 ms, and so on up to every
+            20 ms (with a seed, a jitter later), in turn with the other threads
         """
         return wait(predicate, limit)
 
@@ -253,7 +254,10 @@ class Simulation:
             self.run(0)
 
     def deadlocks(self) -> list[str]:
-        """Return the threads that wait for a lock for ever: the name of each, its file and line."""
+        """Return the threads that wait for each other's locks for ever: the name of each, its file and line.
+
+        So does one that waits for the lock of an ended thread. Events and queues do not count.
+        """
         locks = {}
         for thread, (end, _, lock) in list(self._waits.items()):
             if end == math.inf and getattr(lock, 'holder', None) and _place_of(thread):
