@@ -793,9 +793,9 @@ def test_seconds_count_from_the_begin(simulation, bench):
 
 def test_failed_test_names_the_command(simulation, bench):
     simulation.seed(7)
-    with simulation.master.compose('robot', 'robot.launch'):
+    with simulation.master.compose('robot', 'robot.launch', robot='red'):
         simulation.at(3)
-        command = 'rosrun pharos compose --seed 7 --at 3.000 robot robot.launch'
+        command = 'rosrun pharos compose --seed 7 --at 3.000 robot robot.launch robot:=red'
         assert simulation.command() == command
 
 

@@ -13,6 +13,7 @@ import queue
 import random
 import select
 import selectors
+import shlex
 import sys
 import threading
 import time
@@ -333,10 +334,11 @@ def init_node(this_run, *args, original=ScriptRun.init_node, **options):
         time.sleep(_simulation.random.uniform(0, START_DELAY * _simulation.jitter))
 
 
-def compose(master, package, file, *options, original=composition.compose):
-    """Stand in for ``composition.compose``: a failed test names the launch file."""
-    _simulation.launch_file = f'{package or ""} {file}'
-    return original(master, package, file, *options)
+def compose(master, package, file, args, *options, original=composition.compose):
+    """Stand in for ``composition.compose``: a failed test names the launch file with its arguments."""
+    arguments = [f'{name}:={value}' for name, value in args.items()]
+    _simulation.launch_file = shlex.join([*filter(None, [package]), str(file), *arguments])
+    return original(master, package, file, args, *options)
 
 
 def fork(original=os.fork):
