@@ -95,6 +95,16 @@ def test_pharos_gets_latched_message_of_rospy(peer, node):
     assert Mailbox(node, '/latched').next().data == 'kept'  # typed as the master says
 
 
+def test_later_channel_knows_who_latched_the_message(peer, node):
+    """By the connection header, as in rospy."""
+    peer.run("out = rospy.Publisher('/words', std_msgs.msg.String, queue_size=1, latch=True)")
+    peer.run("out.publish('x')")
+    assert Mailbox(node, '/words', STRING).next().data == 'x'
+    later = Mailbox()
+    node.interested_in('/words', STRING, later, from_='/peer')
+    assert later.next()._connection_header['callerid'] == '/peer'
+
+
 def test_rospy_gets_latched_message_of_pharos(peer, node):
     node.output_channel('/kept', STRING, latch=True).send(data='kept')
     assert peer.value(f"rospy.wait_for_message('/kept', std_msgs.msg.String, {TIMEOUT})").data == (

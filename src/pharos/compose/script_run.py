@@ -494,7 +494,9 @@ class ScriptRun(Run):
             sys.exit(1)
 
     def end_program(self, timeout: float) -> set[threading.Thread]:
-        """End the program as Ctrl-C does: handlers and hooks, main thread, then created nodes.
+        """End the program as Ctrl-C does: handlers, hooks, main thread, then created nodes that are left.
+
+        Python's own handler of SIGINT stops the created nodes first.
 
         :param timeout: seconds for the main thread
         :returns: the program's threads that go on: a SystemExit waits at their next line of Python

@@ -29,7 +29,7 @@ class CallbackOrder:
     """The order of the callbacks of one node.
 
     Each message gets a number when it reaches the node. A queue has its turn if no other one delays
-    it: by a message with a lower number that waits, or by a callback that runs.
+    it: by a callback that runs, or if it runs none, by a message with a lower number that waits.
 
     :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
         has no more threads

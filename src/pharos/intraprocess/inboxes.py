@@ -60,7 +60,7 @@ class BoundedQueue:
 
 
 class Inbox(BoundedQueue):
-    """The messages that wait for one callback.
+    """The messages that wait for a channel, or for all callbacks of plain rospy of a topic.
 
     ``jobs`` of the callback queue owns what waits; ``messages`` counts it, and orders the drops. A
     message waits as the job ``(number, inbox, (value, thaw, header))``. The value is a frozen

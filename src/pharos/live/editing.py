@@ -67,7 +67,8 @@ def reload(node):
     stacks = map(traceback.walk_stack, sys._current_frames().values())
     running = {'__init__', *(frame.f_code.co_name for stack in stacks for frame, _ in stack)}
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
+    # a thread sees a half of the change only if that takes longer, reads a file, or the thread waits already
+    sys.setswitchinterval(CHANGE_LIMIT)
     try:
         edits = [(module, tree, _read(module, tree, notes, undo)) for module, tree in trees]
         for module, tree, changes in edits:
@@ -276,6 +277,7 @@ def _change(running, owner, name, new, is_import):
             return TAKES_EFFECT
         # super() needs the class
         is_bound = new_code and (code or '__class__' in new_code.co_freevars)
+        # a class in a class; reload() changes the members of those of a module one by one
         if is_bound or isinstance(former, type) or _is_field(owner, name):
             return AT_RESTART
     setattr(owner, name, new)

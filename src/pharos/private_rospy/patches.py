@@ -227,7 +227,7 @@ def signal_shutdown(original: Callable, run: Run) -> Callable:
 def is_shutdown(original: Callable, run: Run) -> bool:
     """rospy is shut down only at the end of a stop, which waits for loops that ask this.
 
-    This is True once the stop has begun.
+    This is True once the stop has begun; in a script, once its handlers and hooks have run.
     """
     run.checkpoint()
     if run.stopping.is_set():

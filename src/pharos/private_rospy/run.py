@@ -102,7 +102,8 @@ class Run:
         # names, the newest last
         self.ended_souls: collections.deque[str] = collections.deque(maxlen=10)
         self.endpoints = []  # also those that the stop has closed, for the next start
-        self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
+        # set when a stop begins, in a script after its handlers and hooks: sleeps and waits end
+        self.stopping = threading.Event()
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
         self.threads: set[threading.Thread] = set()
         self.ended_cpu_seconds = 0.0  # of threads that have ended

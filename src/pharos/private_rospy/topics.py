@@ -341,12 +341,16 @@ class SubscriptionOverlay:
     def deliver(self, message: Any, connection: Any, size: int) -> None:
         """Count a message that came by a connection, and give it to all subscriptions that hear that.
 
-        :param size: bytes of the message and its length
+        :param size: bytes of the message; by TCPROS with those of its length
         """
         connection.stat_bytes += size
         connection.stat_num_msg += 1
-        # for later subscribers: a callback may change the message
-        latch = copy_of(message) if connection.is_latched else None
+        latch = None
+        if (
+            connection.is_latched
+        ):  # one for all later callbacks; those of now may change the message
+            latch = copy_of(message)
+            latch._connection_header = connection.header
         share = connection.share
         if share:
             with share.lock:

@@ -170,7 +170,7 @@ class SharedMemoryHandler(ProtocolHandler):
 class Reader:
     """The thread that reads all connections of this process by shared memory.
 
-    Each round takes all messages that are there, and delivers them in the order of sending. If a
+    Each round takes some 100 messages (MAX_MESSAGES), and delivers those in the order of sending. If a
     socket has a message, all that was sent before is there, too, but for what waits in a publisher
     for a receipt. The thread waits for no callback.
     """
@@ -204,7 +204,10 @@ class Reader:
                 self._epoll.unregister(connection.descriptor)
 
     def copy_once(self, key: tuple, memory: memoryview) -> bytes:
-        """Return the bytes of a message in memory; one copy is for all nodes of this process."""
+        """Return the bytes of a message in memory.
+
+        One copy is for all nodes of this process, unless another large message is read in between.
+        """
         if key != self._last_copy[0]:
             self._last_copy = key, bytes(memory)
         return self._last_copy[1]

@@ -28,7 +28,7 @@ from pharos.waiting import let_senders_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher; beyond that, the slowest readers lose messages
-MAX_EXCESS = 10  # a file so many times as large as its message is given back
+MAX_EXCESS = 10  # a file more than so many times as large as a message does not take it
 #: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages;
 #: the time of sending, as of time.monotonic(), which is the same for all processes of a host
 PACKET = struct.Struct('<bBQId')

@@ -87,7 +87,9 @@ class Simulation:
         self.seed(0)
 
     def seed(self, number: int, jitter: float = JITTER) -> None:
-        """Have each sleep last a little longer, by chance, and programs get other random numbers.
+        """Have each sleep, start of a thread and wait with a limit last a little longer, by chance.
+
+        Programs get other random numbers.
 
         Programs start later, too, by up to 30 times the longest delay of a sleep.
 
@@ -228,8 +230,8 @@ class Simulation:
     def play(self, bag: str, topics: list[str] | None = None) -> None:
         """Publish the messages of a bag, each when all before it is done; return at its end.
 
-        The time jumps to one second before the begin of the bag. If that has passed, the bag is played
-        from now on; the stamps in its messages stay.
+        The time jumps to one second before the begin of the bag. If the begin has passed, the bag is
+        played from now on; the stamps in its messages stay.
 
         :raises PharosError: if the bag has no message of one of these topics, is damaged, or has a gap of
             more than a day

@@ -376,7 +376,7 @@ def is_use_simtime(original, run):
 
 @patch('rospy.topics', '_PublisherImpl.publish')
 def publish(original, run, publisher, message, *options, **more):
-    """rospy only sends. This also records what a node sends, if the simulation shall."""
+    """rospy only sends. This also records what a node publishes, if the simulation shall."""
     original(publisher, message, *options, **more)
     if _simulation:
         _simulation.last_messages[publisher.name] = copy_of(message)
