@@ -19,7 +19,6 @@ from typing import Any, Callable
 
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
-YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its limit
 SLOW = 3e-3  # seconds; the callbacks on later messages do not wait longer for one that runs
 TURN_PERIOD = 1e-3  # seconds between two looks whether it is a queue's turn
 TURN_LIMIT = 0.05  # seconds that a callback waits at most, also for those that have not begun
@@ -236,7 +235,7 @@ class CallbackQueue:
     # -- the thread
 
     def request_thread(self) -> bool:
-        """Have the thread run the jobs; return True if there is a thread, and this has woken it."""
+        """Have the thread run the jobs; return True if it has slept, and this has woken it."""
         if self.closed or not self.jobs:
             return False
         if not self.thread:
@@ -246,7 +245,7 @@ class CallbackQueue:
         elif self._wake_lock.locked():
             self.request_lock.acquire(False)
             self.wake()
-            return True
+            return not self.running_thread
         return False
 
     def wake(self) -> None:
@@ -305,10 +304,9 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     """Wake the threads of some callback queues; a publisher calls this.
 
     :param last_wake: what the last call for the same publisher has returned
-    :param may_wait: True: then wait until each thread begins to look for messages, up to YIELD_LIMIT;
-        after one that takes so long, since it is in a callback, wait for no other
-    :returns: the time of the last wake, as of perf_counter(). After a wait that took so long it is
-        YIELD_PAUSE later, and the publisher waits for no thread before that
+    :param may_wait: True: then wait until each thread that has slept runs, up to YIELD_LIMIT; after one
+        that takes so long wait for no other
+    :returns: the time of the last wake, as of perf_counter()
     """
     now = time.perf_counter()
     woken_queues = [each for each in callback_queues if each.request_thread()]
@@ -319,6 +317,5 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
         for callback_queue in woken_queues:
             # _loop() frees the lock
             if not callback_queue.request_lock.acquire(True, YIELD_LIMIT):
-                return now + YIELD_PAUSE
-    # after the wait: to wait is no rest of the publisher
-    return max(last_wake, time.perf_counter())
+                break
+    return time.perf_counter()  # after the wait: to wait is no rest of the publisher
