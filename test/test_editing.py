@@ -116,9 +116,10 @@ def test_reload_loses_no_message(bench, master, program):
     assert [number // 1000 for number in heard] == [*range(1, 201)]
 
 
+@pytest.mark.parametrize('lines', ['{}\nGAIN = 2', 'GAIN = 2\n{}'], ids=['before', 'after'])
 @pytest.mark.parametrize('new', ['def broken(:', 'class Bad(int, int): pass'])
-def test_invalid_edit_changes_nothing(bench, program, ask, new):
-    text = PROGRAM.replace('GAIN = 1', f'{new}\nGAIN = 2')
+def test_invalid_edit_changes_nothing(bench, program, ask, new, lines):
+    text = PROGRAM.replace('GAIN = 1', lines.format(new))
     with open(bench.write(text)) as file:
         line = file.read().splitlines().index(new) + 1
     with pytest.raises(

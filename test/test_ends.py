@@ -55,6 +55,38 @@ def test_forked_child_ends_nothing_of_its_parents(master, bench):
     assert script.is_running and '/program' in [each.name for each in master.nodes()]
 
 
+@pytest.mark.parametrize('number', ['SIGINT', 'SIGTERM'])
+def test_signal_to_its_own_process_ends_the_program_alone(bench, number):
+    text = f'''
+        rospy.init_node('program')
+        rospy.on_shutdown(lambda: say('hook'))
+        os.kill(os.getpid(), 0)
+        os.kill(os.getpid(), signal.{number})
+        rospy.spin()
+        say('ended')
+        '''
+    script = bench.load(text)
+    script.wait(TIMEOUT)
+    assert bench.said()[0] == 'hook'
+    until(lambda: not script.is_running)
+
+
+def test_hook_that_raises_is_printed_and_kept(bench, capfd):
+    text = '''
+        def hook(): return 1 / 0
+        rospy.init_node('program')
+        rospy.on_shutdown(lambda: say('first'))
+        rospy.on_shutdown(hook)
+        rospy.on_shutdown(lambda: say('last'))
+        rospy.spin()
+        '''
+    script = bench.load(text)
+    script.stop()
+    assert bench.said() == ['first', 'last']
+    assert [type(error) for error in script.errors] == [ZeroDivisionError]
+    assert 'ZeroDivisionError: division by zero' in capfd.readouterr().err
+
+
 def test_system_default_of_sigint_ends_at_once(bench):
     text = '''
         rospy.init_node('program')

@@ -677,7 +677,7 @@ def test_delegate_changes_the_class_of_its_node(master, node, again):
     until(lambda: isinstance(other, Fast))
 
 
-@pytest.mark.parametrize('cls', [dict, 'Fast', None])
+@pytest.mark.parametrize('cls', [dict, type('Plain', (), {}), 'Fast', None])
 def test_node_becomes_only_a_node(node, cls):
     with pytest.raises(TypeError):
         node.become(cls)

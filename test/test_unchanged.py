@@ -715,6 +715,18 @@ def test_closed_output_silences_no_other(master, bench, line):
         assert text in composed.output
 
 
+def test_closed_output_keeps_what_was_written_before(bench, capfd):
+    text = '''
+        sys.stdout.write('half a line')
+        sys.stdout.close()
+        try: print('more')
+        except ValueError as error: say(error)
+        '''
+    bench.load(text).wait(TIMEOUT)
+    assert 'half a line' in capfd.readouterr().out
+    assert bench.said() == ['I/O operation on closed file.']
+
+
 def test_reopened_output_is_written(bench):
     """A usual cure for an error of encoding, in two programs."""
     text = '''
