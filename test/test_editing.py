@@ -160,6 +160,7 @@ SAID = {
     'class statement': ('    k = K', '    k = K\n    print()', [': takes effect at a restart']),
     'generator': ('yield 1', 'yield 2', ['count ' + AT_NEXT_CALL]),
     'loop that runs': ('(0.01)', '(0.02)', ['main ' + AT_NEXT_CALL]),
+    'annotated value': ('K = 1', 'K: int = 2', ['K takes effect']),
     'new value': ('K = 1', 'K = 1\nNEW = len("ab")', ['NEW takes effect']),
     'exit': ('K = 1', 'import helper, leave', None),
     'empty file': (KINDS, '', ['K has gone; it stays in force', 'C has gone', 'main has gone']),
@@ -180,11 +181,34 @@ def test_answer_says_what_is_so(bench, old, new, lines):
             script.reload()
     else:
         answer = script.reload()
-        assert all(line in answer for line in lines), answer
+        assert all(line in answer for line in lines) and '__annotations__' not in answer
         assert script.reload() == 'nothing has changed'
     bench.write(KINDS)
     script.reload()
     assert script.lifecycle is Lifecycle.RUNNING
+
+
+def test_another_function_is_imported(bench):
+    loop = "while not rospy.is_shutdown():\n    say(part('a/b'))\n    rospy.sleep(0.01)\n"
+    text = f"{INIT}from os.path import basename as part\nrospy.init_node('program')\n{loop}"
+    script = bench.load(text)
+    until(lambda: bench.said()[-1:] == ['b'])
+    bench.write(text.replace('basename', 'dirname'))
+    assert 'part takes effect' in script.reload()
+    until(lambda: bench.said()[-1] == 'a')
+
+
+def test_value_that_comes_back_is_not_reset(bench):
+    """It was in force all the time."""
+    text = (
+        INIT + "seen = []\nrospy.init_node('program')\nseen.append(1)\nsay('ready')\nrospy.spin()\n"
+    )
+    script = bench.load(text)
+    until(bench.said)
+    bench.write(text.replace('seen = []\n', ''))
+    assert 'seen has gone; it stays in force' in script.reload()
+    bench.write(text)
+    assert script.reload() == 'nothing has changed'
 
 
 def test_what_has_gone_is_told_after_an_error_elsewhere(bench):
