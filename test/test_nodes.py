@@ -677,6 +677,22 @@ def test_delegate_changes_the_class_of_its_node(master, node, again):
     until(lambda: isinstance(other, Fast))
 
 
+def test_change_that_waits_ends_with_the_stop(master, node):
+    other, begun, go_on = create(master, '/other'), threading.Event(), threading.Event()
+    other.interested_in('/a', STRING, lambda message: [begun.set(), go_on.wait(TIMEOUT)])
+    node.send_to('/a', typed_as=STRING, data='x')
+    assert begun.wait(TIMEOUT)
+    stopper = threading.Thread(target=other.stop, daemon=True)
+    stopper.start()
+    until(other._current_run.stopping.is_set)
+    changer = threading.Thread(target=other.become, args=[Fast], daemon=True)
+    changer.start()
+    go_on.set()
+    for thread in stopper, changer:
+        thread.join(TIMEOUT)
+        assert not thread.is_alive()
+
+
 @pytest.mark.parametrize('cls', [dict, type('Plain', (), {}), 'Fast', None])
 def test_node_becomes_only_a_node(node, cls):
     with pytest.raises(TypeError):
