@@ -27,6 +27,7 @@ from rosgraph.network import encode_ros_handshake_header
 import pharos
 from helpers import PYTHON, ROOT, TIMEOUT, Peer, PharosPeer, Program, create, registrations
 from pharos import BlockNode, Master
+from pharos.private_rospy import connections
 from pharos.testing import Mailbox, until
 from programs.raw_tcpros import (
     FakeNode,
@@ -967,6 +968,24 @@ def test_failed_look_costs_no_other_node(master, monkeypatch, quick_watcher, wha
     monkeypatch.undo()
     rosgraph.Master('/victim', master.url).unregisterPublisher('/rosout', victim.uri)
     until(lambda: '/victim' in master.topic('/rosout').publishers)
+
+
+def test_failed_connection_is_told_and_made_again(master, monkeypatch, quick_watcher, capfd):
+    """Whatever the error is."""
+    link, calls = connections.link_topic, []
+
+    def fail_once(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise RuntimeError('this attempt fails')
+        link(*arguments)
+
+    monkeypatch.setattr(connections, 'link_topic', fail_once)
+    box = Mailbox(create(master, '/ear'), '/words', STRING)
+    create(master, '/mouth').send_to('/words', typed_as=STRING, data='x')
+    assert box.next().data == 'x'
+    output = []
+    until(lambda: output.extend(capfd.readouterr()) or 'this attempt fails' in ''.join(output))
 
 
 def test_failed_look_is_told_once(master, monkeypatch, quick_watcher, capfd):
