@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import threading
+import xmlrpc.client
 
 import actionlib.msg
 import genpy
@@ -93,6 +94,26 @@ def test_pharos_gets_latched_message_of_rospy(peer, node):
         "latched.publish('kept')"
     )
     assert Mailbox(node, '/latched').next().data == 'kept'  # typed as the master says
+
+
+def test_what_a_peer_gets_is_counted(peer, node):
+    """As getBusStats has it, which rosnode and roscpp's tools show."""
+    channel = node.output_channel('/words', STRING, queue_size=10)
+    peer.hear('/words', STRING)
+    until(lambda: channel.connections)
+
+    def counts():
+        sent = xmlrpc.client.ServerProxy(node.uri).getBusStats('/me')[2][0]
+        return [
+            (size, number)
+            for topic, _, rows in sent
+            for _, size, number, _ in rows
+            if topic == '/words'
+        ]
+
+    for _ in range(3):
+        channel.send(data='word')
+    until(lambda: counts() == [(36, 3)])  # 4 bytes, and twice a length
 
 
 def test_later_channel_knows_who_latched_the_message(peer, node):
