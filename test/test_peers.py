@@ -102,15 +102,16 @@ def test_what_a_peer_gets_is_counted(peer, node):
     peer.hear('/words', STRING)
     until(lambda: channel.connections)
 
-    def counts():
+    def traffic():
         topics, _, _ = xmlrpc.client.ServerProxy(node.uri).getBusStats('/me')[2]
-        return [
-            number for topic, _, rows in topics for _, _, number, _ in rows if topic == '/words'
-        ]
+        ((_, size, number, _),) = dict((topic, rows) for topic, _, rows in topics)['/words']
+        return size, number
 
+    size, number = traffic()
+    assert number == 0  # and the bytes of the handshake
     for _ in range(3):
         channel.send(data='word')
-    until(lambda: counts() == [3])
+    until(lambda: traffic() == (size + 36, 3))  # each has two lengths of 4 bytes
 
 
 def test_later_channel_knows_who_latched_the_message(peer, node):
