@@ -89,6 +89,13 @@ e(
     ('def see', '@twice\ndef see'),
 )
 e(
+    'argument of a decorator',
+    "import functools\ndef send(value):\n    def decorate(f):\n        @functools.wraps(f)\n        def w(m):\n            return f(value)\n"
+    "        return w\n    return decorate\n@send(1.0)\ndef see(m):\n    out.publish(m)\n",
+    SUB % 'see',
+    ('@send(1.0)', '@send(2.0)'),
+)
+e(
     'lru_cache function',
     "import functools\n@functools.lru_cache()\ndef f():\n    return 1.0\n" + SEE % 'f()',
     SUB % 'see',
@@ -144,6 +151,12 @@ e(
     "class B:\n    def f(self):\n        return 1.0\nclass C(B):\n    def see(self, m):\n        out.publish(self.f())\n    def f(self):\n        return super().f() * 1.0\n",
     MK,
     ('* 1.0', '* 2.0'),
+)
+e(
+    'super() method added',
+    "class B:\n    def f(self):\n        return 1.0\nclass C(B):\n    def see(self, m):\n        out.publish(self.f())\n",
+    MK,
+    ('class C(B):\n', 'class C(B):\n    def f(self):\n        return super().f() * 2.0\n'),
 )
 e(
     'superclass body',

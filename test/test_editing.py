@@ -198,6 +198,51 @@ def test_another_function_is_imported(bench):
     until(lambda: bench.said()[-1] == 'a')
 
 
+ASKED = """
+import functools
+def times(factor):
+    def decorate(function):
+        @functools.wraps(function)
+        def call(*args): return factor * function(*args)
+        return call
+    return decorate
+class Base:
+    def get(self): return 1
+    @property
+    def more(self): return 1
+class Asked(Base):
+    count = 0
+@times(1)
+def scaled(): return 1
+rospy.init_node('program')
+asked = Asked()
+while not rospy.is_shutdown():
+    say(f'{asked.get()} {asked.more} {scaled()}')
+    rospy.sleep(0.01)
+"""
+METHOD = 'count = 0\n    def get(self): return 1 + super().get()'
+PROPERTY = 'count = 0\n    @property\n    def more(self): return 1 + super().more'
+
+
+@pytest.mark.parametrize(
+    'old, new, line, said',
+    [
+        ('count = 0', METHOD, 'Asked.get takes effect, functions', '2 1 1'),
+        ('count = 0', PROPERTY, 'Asked.more takes effect', '1 2 1'),
+        ('@times(1)', '@times(2)', 'scaled takes effect at a restart', '1 1 1'),
+        ('@times(1)\ndef', 'def', 'scaled takes effect at a restart', '1 1 1'),
+    ],
+)
+def test_answer_is_what_a_call_finds(bench, old, new, line, said):
+    script = bench.load(INIT + ASKED)
+    until(lambda: bench.said()[-1:] == ['1 1 1'])
+    bench.write(INIT + ASKED.replace(old, new))
+    assert line in script.reload()
+    count = len(bench.said())
+    until(lambda: len(bench.said()) > count + 2)
+    assert bench.said()[-1] == said and not script.errors
+
+
 def test_value_that_comes_back_is_not_reset(bench):
     """It was in force all the time."""
     text = (

@@ -8,6 +8,7 @@ import signal
 import textwrap
 import threading
 import time
+import types
 
 import pytest
 import rosnode
@@ -15,6 +16,7 @@ import rosnode
 import pharos
 from helpers import COMPOSE, HEAD, INIT, PYTHON, ROOT, SPIN, TIMEOUT, Program, create, end
 from pharos.compose.control import control
+from pharos.compose.script_run import NamedLines
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -725,6 +727,25 @@ def test_closed_output_keeps_what_was_written_before(bench, capfd):
     bench.load(text).wait(TIMEOUT)
     assert 'half a line' in capfd.readouterr().out
     assert bench.said() == ['I/O operation on closed file.']
+
+
+def test_flush_keeps_what_another_thread_prints_meanwhile():
+    class Terminal:
+        texts = []
+
+        def write(self, text):
+            self.texts.append(text)
+            if 'early' in text:  # other threads run while this one writes
+                lines.write('late')
+
+        def flush(self):
+            pass
+
+    lines = NamedLines(Terminal(), types.SimpleNamespace(name='/me'))
+    lines.write('early')
+    lines.flush()
+    lines.flush()
+    assert ''.join(Terminal.texts) == '[/me] early\n[/me] late\n'
 
 
 def test_reopened_output_is_written(bench):

@@ -169,7 +169,7 @@ class Node(DelegateHolder):
                     run.callback_queue.release()
             except BaseException:
                 self._stop_run()
-                run.endpoints = endpoints  # the next start opens them
+                run.endpoints = endpoints  # the next start opens them: those of the run before
                 raise
 
     @property

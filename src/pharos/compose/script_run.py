@@ -519,6 +519,7 @@ class ScriptRun(Run):
                 self.raise_in_main(SystemExit())
                 end_reads(self.main)
                 left_threads.add(self.main)
+        # rospy's handler of SIGINT has done this already, in most programs
         self.signal_shutdown('stop')
         self.stop_created_nodes()
         self.finished.set()
@@ -613,9 +614,9 @@ class NamedLines:
 
     def flush(self) -> None:
         """Write the rest of the text as a line."""
-        if self._partial_line:
-            self._write([self._partial_line])
-            self._partial_line = ''
+        text, self._partial_line = self._partial_line, ''
+        if text:  # taken before: another thread may add some while this writes
+            self._write([text])
 
     def _write(self, lines: list[str]) -> None:
         text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)

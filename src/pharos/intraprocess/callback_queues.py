@@ -267,8 +267,8 @@ class CallbackQueue:
             return
         self.thread = threading.current_thread()
         try:
-            self._wait_for_first_run()
             while not self.closed:
+                self._wait_for_first_run()
                 with contextlib.suppress(RuntimeError):  # nobody has locked it
                     self.request_lock.release()
                 self.run_jobs()

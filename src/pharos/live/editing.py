@@ -136,17 +136,22 @@ def _read(module, tree, notes, undo):
                 item.decorator_list = []
             owner, found = module, _run(item, module)
             lines = dict.fromkeys(found, line)
+            former, new = former_tree, tree
             if former_class:
                 # the whole body has run, since its statements need each other; the new ones take effect
                 item.decorator_list = decorators
                 owner, found = vars(module)[item.name], dict(vars(found[item.name]))
+                former, new = former_class, item
+                _bind(found.values(), owner)
                 new_items = _new_items(former_class, item)
                 lines = {name: each.lineno for each in new_items for name in _names(each)}
                 others = [each.lineno for each in new_items if not _names(each)]
                 notes += [f'{file}:{number}: {AT_RESTART}' for number in others]
                 notes += _keep(former_class, item, file)
             for name in [name for name in lines if name in found]:
-                if found[name] is not vars(owner).get(name):
+                if _decorators(former).get(name, '') not in ('', _decorators(new).get(name)):
+                    notes.append(f'{owner.__name__}.{name} {AT_RESTART} (line {lines[name]})')
+                elif found[name] is not vars(owner).get(name):
                     _set_value(owner, name, found[name], undo)
                     changes.append((lines[name], owner, name, found[name], hasattr(item, 'names')))
         changes += _copies(module, tree, undo)
@@ -165,6 +170,23 @@ def _run(item, module):
     exec(code, vars(module), found)
     found.pop('__annotations__', None)
     return found
+
+
+def _bind(values, owner):
+    """Have super() in the methods of an edited class find the class that was there."""
+    for value in values:
+        value = getattr(value, 'fget', getattr(value, '__func__', value))
+        function = inspect.unwrap(value) if callable(value) else None
+        names = getattr(getattr(function, '__code__', None), 'co_freevars', ())
+        if '__class__' in names:
+            function.__closure__[names.index('__class__')].cell_contents = owner
+
+
+def _decorators(tree):
+    """Return the decorators of the functions of a module or class: the name of each, and their text."""
+    kinds = ast.FunctionDef, ast.AsyncFunctionDef
+    functions = [item for item in tree.body if isinstance(item, kinds)]
+    return {item.name: ''.join(map(ast.dump, item.decorator_list)) for item in functions}
 
 
 def _set_value(owner, name, new, undo):

@@ -218,7 +218,10 @@ def wait_for_next(original: Callable, run: Run, self: Any) -> None:
 
 @replace('rospy.core', 'signal_shutdown')
 def signal_shutdown(original: Callable, run: Run) -> Callable:
-    """rospy ends itself alone. This stops the node."""
+    """rospy ends itself alone. This stops the node, in another thread.
+
+    In a script it runs the hooks and closes rospy in this thread; the program's end stops the node.
+    """
     run.rospy_signal_shutdown = original
     return run.signal_shutdown
 

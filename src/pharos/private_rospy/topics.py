@@ -346,19 +346,19 @@ class SubscriptionOverlay:
         connection.stat_bytes += size
         connection.stat_num_msg += 1
         latch = None
-        if (
-            connection.is_latched
-        ):  # one for all later callbacks; those of now may change the message
+        if connection.is_latched:
+            # one for all later callbacks; those of now may change the message
             latch = copy_of(message)
             latch._connection_header = connection.header
+        # before the message is given: a callback may add another one at once
         share = connection.share
         if share:
             with share.lock:
-                self.give(connection.subscriptions, message, connection, size)
                 connection.latch = latch
+                self.give(connection.subscriptions, message, connection, size)
         else:
-            self.give([self], message, connection, size)
             connection.latch = latch
+            self.give([self], message, connection, size)
 
     def give(self, subscriptions: Iterable, message: Any, connection: Any, size: int) -> None:
         """Give each inbox of some subscriptions a message of its own; shared ones get one and the same."""
