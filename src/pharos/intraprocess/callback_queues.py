@@ -76,7 +76,8 @@ class CallbackQueue:
     :ivar jobs: the messages of all inboxes, as Inbox says
     :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or waits for their turn; or None
-    :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
+    :ivar thread: the thread of the queue, from the first message on; None if the thread has ended by an
+        exception
     :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
     """
 
@@ -274,8 +275,9 @@ class CallbackQueue:
                 self.run_jobs()
                 if not self.closed:
                     self._wake_lock.acquire()
-        finally:  # after an exception the next message starts another thread
-            self.thread = None
+        finally:
+            if not self.closed:  # after an exception the next message starts another thread
+                self.thread = None
             self._loop_lock.release()
 
     def stop(self) -> None:
