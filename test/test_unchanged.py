@@ -1,10 +1,12 @@
 """Programs in one process do what each of them does in a process of its own."""
+import collections
 import contextlib
 import gc
 import io
 import itertools
 import os
 import signal
+import sys
 import textwrap
 import threading
 import time
@@ -729,23 +731,28 @@ def test_closed_output_keeps_what_was_written_before(bench, capfd):
     assert bench.said() == ['I/O operation on closed file.']
 
 
-def test_flush_keeps_what_another_thread_prints_meanwhile():
-    class Terminal:
-        texts = []
+def test_flush_beside_other_threads_loses_nothing():
+    texts = []
+    terminal = types.SimpleNamespace(write=texts.append, flush=lambda: time.sleep(0))
+    lines = NamedLines(terminal, types.SimpleNamespace(name='/me'))
 
-        def write(self, text):
-            self.texts.append(text)
-            if 'early' in text:  # other threads run while this one writes
-                lines.write('late')
+    def write():
+        for _ in range(1000):
+            print('x', file=lines)
+            print('y', end='', file=lines, flush=True)
 
-        def flush(self):
-            pass
-
-    lines = NamedLines(Terminal(), types.SimpleNamespace(name='/me'))
-    lines.write('early')
-    lines.flush()
-    lines.flush()
-    assert ''.join(Terminal.texts) == '[/me] early\n[/me] late\n'
+    threads = [threading.Thread(target=write) for _ in range(4)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    counts = collections.Counter(''.join(texts))
+    assert counts['x'] == counts['y'] == 4000
 
 
 def test_reopened_output_is_written(bench):

@@ -170,8 +170,10 @@ def _show_differences(simulation, options):
     if lines:
         print('\n'.join(lines))
         left = lines_of(max(SMALL, options.tolerance))
-        if left != lines:
-            _show_first(left)
+        if not left:
+            print(f'none by --tolerance {SMALL}')
+        elif left != lines:
+            print(f'the first by --tolerance {SMALL}: {left[0]}')
         if simulation.lost:
             print(f'this run was not exact, since {simulation.lost} lost the turn: run it again')
         return True
@@ -179,14 +181,6 @@ def _show_differences(simulation, options):
         topics = bag.get_type_and_topic_info()[1]
         print(f'as {options.expect}: {bag.get_message_count()} messages of {len(topics)} topics')
     return False
-
-
-def _show_first(lines):
-    """Show the first of the differences that are left by a tolerance of SMALL."""
-    text = f'none by --tolerance {SMALL}'
-    if lines:
-        text = f'the first by --tolerance {SMALL}: {lines[0]}'
-    print(text)
 
 
 def _fix_hashes(seed):

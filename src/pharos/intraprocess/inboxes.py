@@ -80,9 +80,8 @@ class Inbox(BoundedQueue):
         self.callback = callback
         self.inline = inline
         self.shared = shared
-        self._capacity = (
-            math.inf
-        )  # the last answer of capacity_for(): if full, and at powers of two
+        # the last answer of capacity_for(), which put() asks if the queue is full, and at powers of two
+        self._capacity = math.inf
         if callback_queue:  # a channel attaches when it opens
             self.attach(callback_queue)
 

@@ -136,20 +136,22 @@ def _read(module, tree, notes, undo):
                 item.decorator_list = []
             owner, found = module, _run(item, module)
             lines = dict.fromkeys(found, line)
-            former, new = former_tree, tree
+            former_scope, new_scope = former_tree, tree
             if former_class:
                 # the whole body has run, since its statements need each other; the new ones take effect
                 item.decorator_list = decorators
                 owner, found = vars(module)[item.name], dict(vars(found[item.name]))
-                former, new = former_class, item
+                former_scope, new_scope = former_class, item
                 _bind(found.values(), owner)
                 new_items = _new_items(former_class, item)
                 lines = {name: each.lineno for each in new_items for name in _names(each)}
                 others = [each.lineno for each in new_items if not _names(each)]
                 notes += [f'{file}:{number}: {AT_RESTART}' for number in others]
                 notes += _keep(former_class, item, file)
+            former_decorators, new_decorators = map(_decorators, (former_scope, new_scope))
             for name in [name for name in lines if name in found]:
-                if _decorators(former).get(name, '') not in ('', _decorators(new).get(name)):
+                former_text = former_decorators.get(name)
+                if former_text and former_text != new_decorators.get(name):
                     notes.append(f'{owner.__name__}.{name} {AT_RESTART} (line {lines[name]})')
                 elif found[name] is not vars(owner).get(name):
                     _set_value(owner, name, found[name], undo)
@@ -173,10 +175,13 @@ def _run(item, module):
 
 
 def _bind(values, owner):
-    """Have super() in the methods of an edited class find the class that was there."""
+    """Have super() in the methods of an edited class find the class that was there.
+
+    All methods of a class share the cell in which it looks.
+    """
     for value in values:
-        value = getattr(value, 'fget', getattr(value, '__func__', value))
-        function = inspect.unwrap(value) if callable(value) else None
+        method = getattr(value, 'fget', getattr(value, '__func__', value))
+        function = inspect.unwrap(method) if callable(method) else None
         names = getattr(getattr(function, '__code__', None), 'co_freevars', ())
         if '__class__' in names:
             function.__closure__[names.index('__class__')].cell_contents = owner

@@ -150,9 +150,8 @@ def no_delay(original: Callable, run: Run, sock: socket.socket, is_tcp_nodelay: 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
 def start_xmlrpc(original: Callable, run: Run, self: Any) -> None:
     """rospy binds the port in another thread, and prints an error. This binds here, and raises."""
-    original.__globals__[
-        'print'
-    ] = lambda text: None  # _run_init() prints an error that it also raises
+    # _run_init() prints an error that it also raises
+    original.__globals__['print'] = lambda text: None
     self._run_init()
     server = self.server
 

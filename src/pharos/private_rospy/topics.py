@@ -156,7 +156,8 @@ class PublisherOverlay:
                 message.header.seq = self.seq
                 if message.header.frame_id is None:
                     message.header.frame_id = '0'
-            needs_check = channel and not others  # nobody serializes the message of a channel
+            # nobody serializes the message of a channel
+            needs_check = channel is not None and not others
             if inboxes_by_thaw or is_latched or needs_check:
                 frozen = self.freeze(message)
                 if is_latched:

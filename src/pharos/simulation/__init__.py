@@ -89,9 +89,8 @@ class Simulation:
     def seed(self, number: int, jitter: float = JITTER) -> None:
         """Have each sleep, start of a thread and wait with a limit last a little longer, by chance.
 
-        Programs get other random numbers.
-
-        Programs start later, too, by up to 30 times the longest delay of a sleep.
+        Programs get other random numbers. They start later, too, by up to 30 times the longest delay of
+        a sleep.
 
         :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
         :param jitter: the longest delay of a sleep, in seconds; each size is as probable as ten times it
@@ -258,7 +257,7 @@ class Simulation:
     def deadlocks(self) -> list[str]:
         """Return the threads that wait for each other's locks for ever: the name of each, its file and line.
 
-        So does one that waits for the lock of an ended thread. Events and queues do not count.
+        One that waits for the lock of an ended thread is among them. Events and queues do not count.
         """
         locks = {}
         for thread, (end, _, lock) in list(self._waits.items()):

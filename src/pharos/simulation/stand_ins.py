@@ -336,8 +336,9 @@ def init_node(this_run, *args, original=ScriptRun.init_node, **options):
 
 def compose(master, package, file, args, *options, original=composition.compose):
     """Stand in for ``composition.compose``: a failed test names the launch file with its arguments."""
-    arguments = [f'{name}:={value}' for name, value in args.items()]
-    _simulation.launch_file = shlex.join([*filter(None, [package]), str(file), *arguments])
+    words = [package, str(file)] if package else [str(file)]
+    words += [f'{name}:={value}' for name, value in args.items()]
+    _simulation.launch_file = shlex.join(words)
     return original(master, package, file, args, *options)
 
 
