@@ -14,6 +14,7 @@ import std_msgs.msg
 
 from helpers import TIMEOUT, Gate, PharosPeer, create
 from pharos import BlockNode, message_class, testing
+from pharos.intraprocess.callback_queues import TURN_LIMIT
 from pharos.testing import Mailbox, until
 
 INT, STRING = 'std_msgs/Int32', 'std_msgs/String'
@@ -237,11 +238,16 @@ def test_feedback_comes_before_result(simulation, create_node):
         simulation.seed(seed, JITTER)
         for number in range(10):
             feedback = []
-            client.send_goal(
-                actions.TestGoal(number), feedback_cb=lambda m: feedback.append(m.feedback)
-            )
+
+            def hear(message, heard=feedback):
+                heard.append(message.feedback)
+                time.sleep(0.01)  # goes on as the next goal is sent
+
+            begin = time.monotonic()
+            client.send_goal(actions.TestGoal(number), feedback_cb=hear)
             assert client.wait_for_result(client_node.ros.Duration(10))
             assert client.get_result().result == 2 * number
+            assert time.monotonic() - begin < TURN_LIMIT  # they wait for send_goal() alone
             assert feedback == [number + 1]
 
 

@@ -33,7 +33,6 @@ class CallbackOrder:
     :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
         has no more threads
     :ivar numbers: the numbers of the messages to come
-    :ivar is_paused: True: no callback that waits for its turn begins, for TURN_LIMIT at most
     :ivar queues: a dict with the callback queues that have an inbox as its keys
     """
 
@@ -41,13 +40,12 @@ class CallbackOrder:
         self.start_thread = start_thread
         self.numbers = itertools.count()
         self.queues = {}
-        self.is_paused = False
 
     def has_turn(self, callback_queue: CallbackQueue, number: float) -> bool:
-        """True if no callback on a message before this number delays the queue's next one."""
-        if self.is_paused:
-            return False
+        """True if the queue does not pause, and no callback on an earlier message delays its next one."""
         now = time.perf_counter()
+        if now < callback_queue.pause_end:
+            return False
         for queue in list(self.queues):
             if queue is not callback_queue and queue.delays(number, now):
                 return False
@@ -70,11 +68,12 @@ class CallbackQueue:
     channel of the node is inline.
 
     :param order: the CallbackOrder of the node
-    :param first_pause: seconds until the first callback, unless release() ends the pause before. A
-        queue that is made meanwhile prolongs the pause to the end of its own: a constructor may
-        subscribe to several topics before it has set all that its callbacks use
+    :param first_pause: seconds that the queue pauses at first. A queue that is made meanwhile prolongs
+        the pause to the end of its own: a constructor may subscribe to several topics before it has
+        set all that its callbacks use
     :ivar jobs: the messages of all inboxes, as Inbox says
-    :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
+    :ivar pause_end: the time when the pause ends, as of perf_counter(); 0 after the pause. No callback
+        begins before it, unless release() ends the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or waits for their turn; or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended by an
         exception
@@ -92,16 +91,17 @@ class CallbackQueue:
         self.order = order
         self.jobs = collections.deque()
         self._maker = get_ident()  # the thread that has made the queue
-        now = time.perf_counter()
-        self.pause_end = now + first_pause if first_pause else 0.0
-        for queue in list(order.queues):
-            if now < queue.pause_end < self.pause_end:
-                queue.pause_end = self.pause_end
+        self.pause_end = 0.0
+        if first_pause:
+            self.pause(first_pause)
+            for queue in list(order.queues):
+                if 0 < queue.pause_end < self.pause_end:
+                    queue.pause_end = self.pause_end
         # The next two locks guard nothing. They are signals, which any thread may give: the handler of
         # a signal may raise between any two lines of a publisher, and the next message gives them again.
         # Locked: the thread may sleep. Unlocked: it has to look for jobs before it sleeps, and that
-        # look locks it. Who runs the queue takes it: in the thread's rest, in the first pause, and in a wait
-        # for the turn.
+        # look locks it. Who runs the queue takes it: in the thread's rest, in the pause, and in a wait for
+        # the turn.
         self._wake_lock = threading.Lock()
         self._wake_lock.acquire()
         # Locked: a publisher has woken the thread, which has not begun to look, or has waited for that.
@@ -111,13 +111,17 @@ class CallbackQueue:
         self._loop_lock = threading.Lock()  # held by the thread: there is but one
         self._running_lock = threading.Lock()  # held by the thread that runs callbacks
 
+    def pause(self, seconds: float) -> None:
+        """Begin no callback for so many seconds, unless release() ends the pause before."""
+        self.pause_end = time.perf_counter() + seconds
+
     def release(self) -> None:
-        """End the first pause; any thread may do so."""
+        """End the pause; any thread may do so."""
         self.pause_end = 0.0
         self.request_thread()
 
     def release_before_sleep(self) -> None:
-        """End the first pause if this thread has made the queue: it would sleep while delegates wait."""
+        """End the pause if this thread has made the queue: it would sleep while delegates wait."""
         if self.pause_end and self._maker == get_ident():
             self.release()
 
@@ -157,7 +161,7 @@ class CallbackQueue:
     # -- running
 
     def run_jobs(self, in_turn: bool = True) -> None:
-        """Run all jobs in this thread, unless another thread does so already, or the first pause goes on.
+        """Run all jobs in this thread, unless another thread does so already, or the queue pauses.
 
         Of two threads that come at one moment, one waits, and runs what the other has left.
 
@@ -208,7 +212,7 @@ class CallbackQueue:
 
     def run_jobs_here(self) -> None:
         """Run all jobs in this thread; wait while another thread runs some of them."""
-        self._wait_for_first_run()
+        self._wait_for_pause_end()
         while self.jobs and not self.closed:
             self.run_jobs()
             with self._running_lock:
@@ -254,8 +258,8 @@ class CallbackQueue:
         with contextlib.suppress(RuntimeError):  # another thread has woken this one already
             self._wake_lock.release()
 
-    def _wait_for_first_run(self) -> None:
-        """Wait until the first pause is over; release() and stop() wake this."""
+    def _wait_for_pause_end(self) -> None:
+        """Wait until the pause is over; release() and stop() wake this."""
         while self.pause_end and not self.closed:
             pause = self.pause_end - time.perf_counter()
             if pause > 0:
@@ -269,7 +273,7 @@ class CallbackQueue:
         self.thread = threading.current_thread()
         try:
             while not self.closed:
-                self._wait_for_first_run()
+                self._wait_for_pause_end()
                 with contextlib.suppress(RuntimeError):  # nobody has locked it
                     self.request_lock.release()
                 self.run_jobs()

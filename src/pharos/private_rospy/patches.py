@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Callable
 from urllib.parse import urlsplit
@@ -18,6 +19,7 @@ import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
 
+from pharos.intraprocess.callback_queues import TURN_LIMIT
 from pharos.private_rospy import connections, tcpros, topics
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.services import answer, call_by_proxy
@@ -408,16 +410,19 @@ def cleanup(original: Callable, run: Run, self: Any, reason: str) -> None:
 def send_goal(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any) -> None:
     """actionlib drops an answer that comes before send_goal() returns. Here the answer waits.
 
-    No callback that waits for its turn begins meanwhile, for TURN_LIMIT at most: the feedback stays
-    before the result.
+    All queues of plain rospy pause, but for those in their first pause: the feedback stays before
+    the result.
     """
-    order = run.callback_queue.order
-    order.is_paused = True
+    now = time.perf_counter()
+    queues = [each for each in run.callback_queue.order.queues if each.pause_end < now]
+    queues = [each for each in queues if each is not run.callback_queue]
+    for queue in queues:
+        queue.pause(TURN_LIMIT)
     try:
         original(self, *args, **kwargs)
     finally:
-        order.is_paused = False
-        order.pass_turn()
+        for queue in queues:
+            queue.release()
 
 
 # -- parameters, log, services
