@@ -251,6 +251,19 @@ def test_feedback_comes_before_result(simulation, create_node):
             assert feedback == [number + 1]
 
 
+def test_constructor_may_take_its_time_between_two_subscriptions(simulation, create_node):
+    """The first callback waits for a pause after the last one."""
+    ear, mouth = create_node(BlockNode, 'ear'), create_node(BlockNode, 'mouth')
+    mouth.output_channel('/a', INT, latch=True).send(data=1)
+    times = []
+    begin = simulation.now
+    ear.ros.Subscriber('/a', Int32, lambda message: times.append(simulation.now))
+    simulation.run(0.03)
+    ear.ros.Subscriber('/b', Int32, print)
+    simulation.run(1)
+    assert times == [pytest.approx(begin + 0.08, abs=0.01)]
+
+
 def test_waiting_callback_lets_others_run(master):
     """A callback may wait for one of another topic; it holds up that topic for a few ms alone."""
     node, mouth = create(master, '/ear'), create(master, '/mouth')

@@ -561,6 +561,11 @@ STEPS = {
     "rospy.Service('ask', Empty, serve); rospy.spin()\n",
     'client': "from std_srvs.srv import Empty\nask = rospy.ServiceProxy('ask', Empty)\n"
     'while not rospy.is_shutdown(): rospy.sleep(0.5); ask()\n',
+    # its thread starts with the only message
+    'first': 'def hear(message): global count; count += 1\n'
+    "rospy.Subscriber('late', String, hear); rospy.spin()\n",
+    'late': "late = rospy.Publisher('late', String, queue_size=1)\n"
+    "rospy.sleep(12.8); late.publish('once'); rospy.spin()\n",
     'mouth': """
 class Mouth:
     def __init__(self):
@@ -680,7 +685,7 @@ def test_prompt_steps_in_a_node(session):
     if sys.version_info >= (3, 14):
         assert 'write breakpoint() at the line' in session.ask("step('/loop')")
         return
-    for name in ['loop', 'callback', 'timer', 'thread', 'service']:
+    for name in ['first', 'loop', 'callback', 'timer', 'thread', 'service']:
         before = session.ask(f"print(now, node('/{name}').count)").split()
         assert f'/bench/{name}(' in session.ask(f"step('/{name}')")
         session.ask('n')
