@@ -104,14 +104,15 @@ def test_what_a_peer_gets_is_counted(peer, node):
 
     def traffic():
         topics, _, _ = xmlrpc.client.ServerProxy(node.uri).getBusStats('/me')[2]
-        ((_, size, number, _),) = dict((topic, rows) for topic, _, rows in topics)['/words']
-        return size, number
+        ((data_size, rows),) = [each[1:] for each in topics if each[0] == '/words']
+        ((_, size, number, _),) = rows
+        return data_size, size, number
 
-    size, number = traffic()
-    assert number == 0  # and the bytes of the handshake
+    data_size, size, number = traffic()
+    assert data_size == number == 0  # the size is that of the handshake
     for _ in range(3):
         channel.send(data='word')
-    until(lambda: traffic() == (size + 36, 3))  # each has two lengths of 4 bytes
+    until(lambda: traffic() == (36, size + 36, 3))  # each has two lengths of 4 bytes
 
 
 def test_later_channel_knows_who_latched_the_message(peer, node):

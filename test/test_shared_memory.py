@@ -17,7 +17,9 @@ import pytest
 import pharos
 from helpers import TIMEOUT, Gate, InProcessMaster, Peer, PharosPeer, Program, create, stop_nodes
 from pharos import Master
+from pharos.private_rospy.topics import HELD_BYTES
 from pharos.shared_memory.receiving import MemoryReceiver, Reader
+from pharos.shared_memory.sending import MAX_FILES
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -414,6 +416,63 @@ def test_last_messages_survive_stop(node, listener, topic, sizes):
     listener.process.send_signal(signal.SIGCONT)
     stopping.join()
     assert [note[1] for note in listener.notes(topic, 1 + len(sizes))] == [0, *sizes]
+
+
+def test_slow_subscriber_of_rospy_does_not_fall_behind(node, listener, topic):
+    """Without a queue_size it takes one image, and the next one when its callback has ended.
+
+    A channel of the same topic goes on when the subscriber has gone.
+    """
+    listener.listen(topic)
+    listener.run(
+        f"""
+import threading
+gate, heard = threading.Semaphore(0), []
+def hear(message):
+    heard.append(message.header.seq)
+    gate.acquire()
+slow = node.ros.Subscriber({topic!r}, message_class({IMAGE!r}), hear)
+"""
+    )
+    out = node.output_channel(topic, IMAGE, queue_size=1)
+    until(lambda: out.connections == [('/listener', SHARED)], TIMEOUT)
+    for count in range(1, 20):
+        for _ in range(3):
+            out.send(data=bytes(HELD_BYTES))
+        until(lambda count=count: listener.value('len(heard)') >= count, TIMEOUT)
+        listener.run('gate.release()')
+    (last,) = listener.value('heard[-1:]')
+    listener.run('slow.unregister(); gate.release()')
+    assert last > 3 * 19 - 3 * MAX_FILES
+    for _ in range(2):
+        out.send(data=b'more')
+        until(lambda: listener.numbers(topic)[-1] == out.sent)
+
+
+def test_publisher_is_heard_after_a_drop(master, node, listener, topic):
+    """A message that waits for a slow callback, and is dropped, holds up its publisher no longer."""
+    node.queue_bytes = 2 * HELD_BYTES
+    names = []
+    gate = threading.Semaphore(0)
+
+    def hear(message):
+        names.append(message._connection_header['callerid'])
+        gate.acquire()
+
+    subscriber = node.ros.Subscriber(topic, pharos.message_class(IMAGE), hear)
+    near = create(master, '/near').output_channel(topic, IMAGE)
+    listener.run(f'far = node.output_channel({topic!r}, {IMAGE!r})')
+    near.send(data=bytes(HELD_BYTES))
+    until(lambda: names)
+    listener.run(f'far.send(data=bytes({HELD_BYTES}))')
+    until(lambda: subscriber.impl.plain_inbox.messages)
+    for _ in range(3):
+        near.send(data=bytes(HELD_BYTES))
+    assert subscriber.impl.plain_inbox.dropped
+    for _ in range(9):  # not release(9): Python 3.8 has it not
+        gate.release()
+    listener.run(f'far.send(data=bytes({HELD_BYTES}))')
+    until(lambda: '/listener' in names)
 
 
 def test_from_and_to_select(master, node, listener, topic):

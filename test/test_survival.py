@@ -810,6 +810,7 @@ def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
     assert mailbox.next().data == 'hello'
 
 
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason='it leaves locks locked: see doc/limits.md')
 @pytest.mark.parametrize('queue_size', [None, 10])
 def test_handler_that_raises_in_publish(master, peer, queue_size, monkeypatch):
     """The next publish() sends the rest of a message that signals have cut, and then its own."""

@@ -424,7 +424,7 @@ class Node(DelegateHolder):
 
         :raises NodeStoppedError: if the stop has begun before; in a soul also if it begins meanwhile
         :raises SystemExit: in the block of a service, if the stop begins meanwhile; NodeStoppedError if
-            /use_sim_time is set
+            /use_sim_time is set, or Ctrl-C or SIGTERM stops it
         """
         self._check_active()
         run = current.run if current.node is self else self._current_run

@@ -352,7 +352,7 @@ class ScriptRun(Run):
         raise self.exit_request
 
     def _join_threads(self) -> None:
-        """Wait for the threads that are not daemons; a signal ends the wait, as in Python."""
+        """Wait for the threads that are not daemons; a handler that raises ends the wait, as in Python."""
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
             while self.threads_to_join and not self.finished.is_set():
                 self.handle_signal()
@@ -589,6 +589,7 @@ class NamedLines:
         self._stream = stream
         self._run = run
         self._partial_line = ''  # the text after the last line end, not written yet
+        self._lock = threading.RLock()  # of a kind that the handler of a signal may take again
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -608,14 +609,16 @@ class NamedLines:
         """Write the complete lines, keep the rest, and return the number of characters."""
         if self.closed:
             raise ValueError('I/O operation on closed file.')
-        *lines, self._partial_line = (self._partial_line + text).split('\n')
+        with self._lock:  # other threads print, too
+            *lines, self._partial_line = (self._partial_line + text).split('\n')
         self._write(lines)
         return len(text)
 
     def flush(self) -> None:
         """Write the rest of the text as a line."""
-        text, self._partial_line = self._partial_line, ''
-        if text:  # taken before: another thread may add some while this writes
+        with self._lock:
+            text, self._partial_line = self._partial_line, ''
+        if text:
             self._write([text])
 
     def _write(self, lines: list[str]) -> None:

@@ -16,9 +16,8 @@ class BoundedQueue:
 
     ``queue_size`` is the number of messages that wait at most. 0: as many as ``queue_bytes`` hold.
     None is the same as 0 within a process (PlainInbox has more), and by shared memory. By TCPROS,
-    None means no queue, as in rospy: publish() waits for the socket. A subscription of plain rospy
-    without a queue_size reads no more messages until its callbacks have ended, unless its connection
-    is shared: whoever reads for several nodes waits for none.
+    None means no queue, as in rospy: publish() waits for the socket. For a subscription of plain
+    rospy, PlainInbox.receive says what None means.
 
     :ivar messages: the messages that wait, the oldest first
     :ivar dropped: the number of dropped messages
@@ -65,8 +64,9 @@ class Inbox(BoundedQueue):
     ``jobs`` of the callback queue owns what waits; ``messages`` counts it, and orders the drops. A
     message waits as the job ``(number, inbox, (value, thaw, header))``. The value is a frozen
     message. If ``thaw`` is None, the value is the message itself, which came from a socket or is
-    shared. Several publishers may be here at once: who takes a job out of the callback queue's
-    ``jobs`` runs it or drops it. A run takes it from ``jobs`` first, a drop from ``messages``.
+    shared, and has its header already; PlainInbox uses that place. Several publishers may be here
+    at once: who takes a job out of the callback queue's ``jobs`` runs it or drops it. A run takes it
+    from ``jobs`` first, a drop from ``messages``.
 
     :param callback_queue: the CallbackQueue that runs the callback
     :param callback: called as ``callback(message)``; raises no Exception

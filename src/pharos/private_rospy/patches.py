@@ -329,12 +329,6 @@ def subscribe(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any
         connections.connect_all(self.impl)
 
 
-@patch('rospy.topics', 'QueuedConnection')
-def queue_connection(original: Callable, run: Run, connection: Any, queue_size: int | None) -> Any:
-    """rospy's queue is not bounded. A Sender's is; PublisherOverlay has put one there."""
-    return connection
-
-
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
 def receive_and_retry(
     original: Callable,

@@ -4,7 +4,6 @@
 """
 from __future__ import annotations
 
-import collections
 import contextlib
 import functools
 import time
@@ -23,6 +22,7 @@ from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 from pharos.signals import silenced_threads
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
+HELD_BYTES = 1 << 20  # bytes that wait here; what follows by shared memory waits in the publisher
 FLUSH_PERIOD = 0.001  # seconds between two looks
 #: seconds until the first callback of a subscription: a connection between processes takes so long,
 #: and many constructors subscribe before they have set all that their callback uses
@@ -55,7 +55,7 @@ class PublisherOverlay:
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None  # for links and shared memory, by make_header(); ``headers`` is rospy's
         self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
-        # None: find them anew. rospy makes a new list of connections at each change
+        # None: find them anew. rospy makes a new list of connections at each change, but at the end
         self.receivers: Receivers | None = None
 
     def acquire(self) -> None:
@@ -108,7 +108,7 @@ class PublisherOverlay:
     def call_listeners(self, method: str, *arguments: Any) -> None:
         """Have listeners called one after another, as in rospy, and in no thread that holds a lock.
 
-        The thread of the node's delegates calls them.
+        The callback queue of the node's delegates calls them.
         """
         for listener in list(self.subscriber_listeners or ()):  # None: rospy's close() goes on
             block = functools.partial(getattr(listener, method), self.resolved_name, *arguments)
@@ -244,33 +244,43 @@ class PlainInbox(Inbox):
         super().__init__(callback_queue, subscription.call_plain, subscription.queue_size)
         self.subscription = subscription
         self.queue_bytes = subscription.run.node.queue_bytes
-        self._paused_connections = collections.deque()
 
     def receive(self, message: Any, size: int, connection: Any) -> None:  # type: ignore[override]
         """Take a message from a connection.
 
         Without a queue_size, messages wait in the sockets and in the publisher until the callbacks
         have ended; those of a shared connection wait here. The thread that reads a socket of TCPROS
-        runs the callbacks.
+        runs the callbacks. By shared memory the Reader leaves the connection if HELD_BYTES wait,
+        until the callbacks have run on the last of them.
         """
-        if self.queue_size is None:
-            if connection.share:  # who reads for several must not wait for one
-                super().receive(message, size, connection)
-                return
+        paused_connection = None
+        if self.queue_size is None and not connection.share:  # who reads for several waits for none
             if connection.transport_type == 'TCPROS':
                 self.put((message, None, None), size)
                 self.callback_queue.run_jobs_here()
                 return
-            # the Reader reads for all connections, and runs no callback: it leaves this one until resume()
-            connection.pause()
-            self._paused_connections.append(connection)
-        super().receive(message, size, connection)
+            if (len(self.messages) + 1) * size >= HELD_BYTES:
+                connection.pause()
+                paused_connection = connection
+        self.put((message, None, paused_connection), size)
+        self.callback_queue.request_thread()
 
     def run_callback(self, job: tuple) -> None:
-        """Run the callbacks on the message of a job, and have all connections read again."""
+        """Run the callbacks on the message of a job, and have its connection read again."""
         super().run_callback(job)
-        while self._paused_connections:
-            self._paused_connections.popleft().resume()
+        self._resume(job)
+
+    def forget(self, job: tuple) -> bool:
+        is_dropped = super().forget(job)
+        if is_dropped:
+            self._resume(job)
+        return is_dropped
+
+    def _resume(self, job: tuple) -> None:
+        """Have a paused connection read again: its job has it in the place of a header."""
+        _, thaw, paused_connection = job[2]
+        if paused_connection and not thaw:
+            paused_connection.resume()
 
     def capacity_for(self, size: int) -> int:
         """Return how many messages would wait between processes: in publishers and in sockets."""

@@ -281,7 +281,7 @@ class Simulation:
         """Give the turn back, and wait until this thread gets the turn again.
 
         :param end: the time when the wait ends, in nanoseconds
-        :param lock: a Lock; the wait ends when the lock is free
+        :param lock: a Lock or files; the wait ends when ``lock.locked()`` is false
         """
         thread = local.thread
         if self._on_wait:
@@ -313,7 +313,7 @@ class Simulation:
                 self._waits[self._owner] = self.nanoseconds, -1, None
 
     def add_wait(self, thread, end, order=None, lock=None):
-        """Have a thread wait, as :meth:`wait` says; if it has the turn, another thread gets it."""
+        """Have a thread wait, as :meth:`wait` says; if it had the turn, the first in line gets the turn."""
         if order is None:
             thread.look = LOOK
             order = next(self._orders)
