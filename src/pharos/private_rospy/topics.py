@@ -132,7 +132,7 @@ class PublisherOverlay:
         """
         with self.lock:
             # looked at under the lock: so what the handler publishes to this topic comes last
-            if get_ident() in silenced_threads and self.name != '/rosout':
+            if silenced_threads and get_ident() in silenced_threads and self.name != '/rosout':
                 return
             if self.closed:
                 # rospy's publish() returns in this case, too
