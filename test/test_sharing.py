@@ -8,6 +8,7 @@ import pytest
 
 from helpers import TIMEOUT, Peer, create
 from pharos import Master, message_class
+from pharos.private_rospy.topics import SHARED_QUEUE, SOCKET_BYTES
 from pharos.testing import until
 
 STRING = 'std_msgs/String'
@@ -188,6 +189,30 @@ def test_slow_callback_without_queue_size_gets_all(sharing, publisher):
     publisher.run("for letter in 'abcdefghijkl': publisher.publish(letter * 2_000_000)")
     until(lambda: len(heard) == 12)
     assert ''.join(heard) == 'abcdefghijkl'
+
+
+def test_slow_callback_without_queue_size_does_not_fall_behind(sharing, publisher):
+    """It hears what would wait between processes: what is older is dropped."""
+    heard, may_go_on = [], threading.Event()
+
+    def hear(message):
+        heard.append(message.data[0])
+        may_go_on.wait(TIMEOUT)
+
+    create(sharing, '/slow').ros.Subscriber('/words', message_class(STRING), hear)
+    quick = []
+    create(sharing, '/quick').interested_in('/words', STRING, quick.append)
+    until(lambda: publisher.value('publisher.get_num_connections()') == 1)
+    publisher.run("publisher.publish('a')")
+    until(lambda: heard)
+    size = SOCKET_BYTES // 3
+    for letter in 'bcdefghijklmnopqrstuvwxyz':
+        publisher.run(f'publisher.publish({letter!r} * {size})')
+        until(lambda letter=letter: quick[-1].data[0] == letter)
+    may_go_on.set()
+    until(lambda: heard[-1] == 'z')
+    waiting = SHARED_QUEUE + 2  # a message has some bytes more
+    assert ''.join(heard) == 'a' + 'bcdefghijklmnopqrstuvwxyz'[-waiting:]
 
 
 def test_subscriptions_that_come_and_go_disturb_nobody(sharing, publisher):

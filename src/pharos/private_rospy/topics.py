@@ -23,6 +23,9 @@ from pharos.signals import silenced_threads
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 HELD_BYTES = 1 << 20  # bytes that wait here; what follows by shared memory waits in the publisher
+SHARED_QUEUE = (
+    10  # messages: the queue_size of most publishers, of which a shared connection knows nothing
+)
 FLUSH_PERIOD = 0.001  # seconds between two looks
 #: seconds until the first callback of a subscription: a connection between processes takes so long,
 #: and many constructors subscribe before they have set all that their callback uses
@@ -285,11 +288,11 @@ class PlainInbox(Inbox):
     def capacity_for(self, size: int) -> int:
         """Return how many messages would wait between processes: in publishers and in sockets."""
         connections = self.subscription.connections
-        links = links_of(connections)
-        queue_sizes = [link.publisher.queue_size for link in links]
-        # a publisher without a queue_size loses no message
-        publishers_drop = len(links) == len(connections) and all(queue_sizes)
-        if self.queue_size or not links or not publishers_drop:
+        queue_sizes = [link.publisher.queue_size for link in links_of(connections)]
+        queue_sizes += [SHARED_QUEUE for connection in connections if connection.share]
+        # a publisher without a queue_size loses no message; connections of other kinds wait themselves
+        publishers_drop = len(queue_sizes) == len(connections) and all(queue_sizes)
+        if self.queue_size or not queue_sizes or not publishers_drop:
             return super().capacity_for(size)
         socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
         return sum(queue_sizes) + max(1, socket_messages)
