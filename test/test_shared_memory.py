@@ -437,8 +437,10 @@ slow = node.ros.Subscriber({topic!r}, message_class({IMAGE!r}), hear)
     out = node.output_channel(topic, IMAGE, queue_size=1)
     until(lambda: out.connections == [('/listener', SHARED)], TIMEOUT)
     for count in range(1, 20):
+        listener.pause()  # so its reader gets several at once
         for _ in range(3):
             out.send(data=bytes(HELD_BYTES))
+        listener.process.send_signal(signal.SIGCONT)
         until(lambda count=count: listener.value('len(heard)') >= count, TIMEOUT)
         listener.run('gate.release()')
     (last,) = listener.value('heard[-1:]')

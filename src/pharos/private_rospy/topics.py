@@ -263,7 +263,7 @@ class PlainInbox(Inbox):
                 self.callback_queue.run_jobs_here()
                 return
             if (len(self.messages) + 1) * size >= HELD_BYTES:
-                connection.pause()
+                connection.pause(message)
                 paused_connection = connection
         self.put((message, None, paused_connection), size)
         self.callback_queue.request_thread()
@@ -280,10 +280,10 @@ class PlainInbox(Inbox):
         return is_dropped
 
     def _resume(self, job: tuple) -> None:
-        """Have a paused connection read again: its job has it in the place of a header."""
-        _, thaw, paused_connection = job[2]
+        """Have a paused connection read again, which its job has in the place of a header."""
+        message, thaw, paused_connection = job[2]
         if paused_connection and not thaw:
-            paused_connection.resume()
+            paused_connection.resume(message)
 
     def capacity_for(self, size: int) -> int:
         """Return how many messages would wait between processes: in publishers and in sockets."""

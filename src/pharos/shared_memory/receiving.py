@@ -261,6 +261,8 @@ class MemoryReceiver(MemoryTransport):
     is_latched = False
     latch = None
     header = None
+    # the message of the last pause(): the reader takes several at a time, and all of them wait
+    _last_held: object = None
 
     def __init__(self, topic: str, uri: str, sock: socket.socket, subscription) -> None:
         super().__init__('i', topic, uri, sock)
@@ -313,13 +315,14 @@ class MemoryReceiver(MemoryTransport):
             inbox.count_dropped(dropped)
         self._subscription.deliver(message, self, len(data) + len(value))
 
-    def pause(self) -> None:
+    def pause(self, message: object) -> None:
         """Read no more until resume(): messages wait in the socket, and in the publisher."""
+        self._last_held = message
         _reader.remove(self)
 
-    def resume(self) -> None:
-        """Read again."""
-        if not self.done:
+    def resume(self, message: object) -> None:
+        """Read again, if the message was the last one with which pause() was called."""
+        if self._last_held is message and not self.done:
             _reader.add(self)
 
     def end(self, error: Exception) -> None:
