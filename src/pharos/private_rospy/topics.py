@@ -23,9 +23,7 @@ from pharos.signals import silenced_threads
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 HELD_BYTES = 1 << 20  # bytes that wait here; what follows by shared memory waits in the publisher
-SHARED_QUEUE = (
-    10  # messages: the queue_size of most publishers, of which a shared connection knows nothing
-)
+SHARED_QUEUE = 10  # messages: a guess at the queue_size of the publisher of a shared connection
 FLUSH_PERIOD = 0.001  # seconds between two looks
 #: seconds until the first callback of a subscription: a connection between processes takes so long,
 #: and many constructors subscribe before they have set all that their callback uses

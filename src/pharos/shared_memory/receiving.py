@@ -321,7 +321,7 @@ class MemoryReceiver(MemoryTransport):
         _reader.remove(self)
 
     def resume(self, message: object) -> None:
-        """Read again, if the message was the last one with which pause() was called."""
+        """Read again, if the message is that of the last pause()."""
         if self._last_held is message and not self.done:
             _reader.add(self)
 
