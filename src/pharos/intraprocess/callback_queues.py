@@ -94,8 +94,9 @@ class CallbackQueue:
         self.pause_end = 0.0
         if first_pause:
             self.pause(first_pause)
+            now = time.perf_counter()
             for queue in list(order.queues):
-                if 0 < queue.pause_end < self.pause_end:
+                if now < queue.pause_end < self.pause_end:
                     queue.pause_end = self.pause_end
         # The next two locks guard nothing. They are signals, which any thread may give: the handler of
         # a signal may raise between any two lines of a publisher, and the next message gives them again.

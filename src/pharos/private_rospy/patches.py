@@ -408,7 +408,7 @@ def send_goal(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any
     the result.
     """
     now = time.perf_counter()
-    queues = [each for each in run.callback_queue.order.queues if each.pause_end < now]
+    queues = [each for each in list(run.callback_queue.order.queues) if each.pause_end < now]
     queues = [each for each in queues if each is not run.callback_queue]
     for queue in queues:
         queue.pause(TURN_LIMIT)
