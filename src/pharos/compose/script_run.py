@@ -36,7 +36,7 @@ from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim, remember_text
 from pharos.private_rospy.patches import patch
 from pharos.private_rospy.plain import guide
-from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
+from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, items_of, join
 from pharos.transcript import Transcript
 from pharos.waiting import current, wait
 
@@ -448,7 +448,7 @@ class ScriptRun(Run):
             self.exit_request = error
         if self.main in self.souls:
             raise_in(self.main, type(error))
-            for loop in list(self.event_loops):
+            for loop in items_of(self.event_loops):
                 with contextlib.suppress(RuntimeError):  # it is closed
                     # an idle loop waits in C: this wakes it
                     loop.call_soon_threadsafe(bool)
@@ -539,7 +539,7 @@ class ScriptRun(Run):
         super().stop(timeout)
         if not signals.is_ending():
             self._tell_left_threads()
-        for loop in list(self.event_loops):
+        for loop in items_of(self.event_loops):
             with contextlib.suppress(RuntimeError):  # it runs in a thread that is left behind
                 loop.close()
         self.exit_request = None

@@ -426,7 +426,7 @@ class Run:
         if current.service_run is self:  # a service that stops its node goes on
             current.service_run = None
         self.stopping.set()
-        for sock in list(self.calls):
+        for sock in items_of(self.calls):
             shutdown_socket(sock)
 
     def stop(self, timeout: float) -> None:
@@ -455,7 +455,7 @@ class Run:
                 f'left behind, since they did not end in time: {", ".join(left_behind)}'
             )
         self.close_rospy(timeout)
-        for sock in list(self.sockets):
+        for sock in items_of(self.sockets):
             shutdown_socket(sock)  # wakes the threads that read; close() would not
         deadline = time.monotonic() + STOP_LIMIT
         # a thread that ends may have started another one
@@ -465,9 +465,15 @@ class Run:
         logging = self.modules.load('logging')
         logging.disable()  # or a thread left behind would open the file again
         logging.shutdown()
-        for sock in list(self.sockets):
+        for sock in items_of(self.sockets):
             sock.close()  # now that no thread uses it: another file may get its number
         self.mark_stopped()
+
+
+def items_of(weak_set: WeakSet) -> list:
+    """Return what is in a set; other threads may add to it meanwhile, which list() would not bear."""
+    references = list(weak_set.data)  # in C: no other thread runs in between
+    return [item for item in (reference() for reference in references) if item is not None]
 
 
 def join(threads: Iterable[threading.Thread], timeout: float) -> list[threading.Thread]:
