@@ -587,6 +587,15 @@ def test_program_takes_groups(master, bench):
     assert not sonar.is_alive()
 
 
+def test_save_reloads_a_node_of_a_group(master, bench, tmp_path):
+    path = tmp_path / 'robot/scripts/sonar'
+    options = '--group', 'sonar', '--reload'
+    with bench.program('robot', 'sensing.launch', *options) as composed:
+        composed.until(lambda: composed.output.count('hears') > 5)  # looks at the file go on
+        path.write_text(path.read_text().replace('is ready', 'is as ready as can be'))
+        composed.expect('/sonar done: Sonar.report takes effect')
+
+
 def test_commands_control_a_node(master, compose):
     composition = compose(node('sonar', 'robot') + ending('respawn="true"'))
     box = Mailbox(create(master, '/ear'), '/range', 'sensor_msgs/Range')

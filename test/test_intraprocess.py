@@ -85,6 +85,27 @@ def test_restart_keeps_the_way(sender, hearer):
         assert out.connections == [('/hearer', 'INTRAPROCESS')]
 
 
+def test_later_subscriber_of_rospy_sets_the_queue_size(sender, hearer):
+    heard, begun, gate = [], threading.Semaphore(0), threading.Semaphore(0)
+
+    def hear_slowly(message):
+        heard.append(message.data)
+        begun.release()
+        assert gate.acquire(timeout=TIMEOUT)
+
+    cls = pharos.message_class(STRING)
+    hearer.ros.Subscriber('/a', cls, lambda message: None)
+    hearer.ros.Subscriber('/a', cls, hear_slowly, queue_size=1)
+    for number in range(10):
+        sender.send_to('/a', cls(str(number)))
+        if number == 0:
+            assert begun.acquire(timeout=TIMEOUT)
+    for _ in range(2):
+        gate.release()
+    assert begun.acquire(timeout=TIMEOUT)
+    assert heard == ['0', '9']
+
+
 # -- whose message
 
 

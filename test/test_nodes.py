@@ -357,6 +357,32 @@ def test_ended_soul_is_not_run_again(node):
     assert ran == [1]
 
 
+@pytest.mark.parametrize('end', ['raises', 'stops', 'stops by itself'])
+def test_restart_runs_a_soul_again_that_has_not_returned(node, end):
+    begun = threading.Semaphore(0)
+
+    def work(me):
+        begun.release()
+        if end == 'raises':
+            raise ValueError('in vain')
+        if end == 'stops by itself':
+            me.stop()
+        me.sleep(3600)
+
+    node.soul = work
+    node.fork()
+    for _ in range(3):
+        assert begun.acquire(timeout=TIMEOUT)
+        if end == 'raises':
+            until(lambda: node.failures)
+        elif end == 'stops':
+            node.stop()
+        else:
+            until(lambda: not node.is_running)
+        node.restart()
+    assert begun.acquire(timeout=TIMEOUT)
+
+
 def test_ended_soul_leaves_its_name_alone(node):
     blocks = weakref.WeakSet()
     for number in range(30):

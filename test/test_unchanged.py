@@ -89,11 +89,22 @@ FOLDERS = [
     "sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)) + '/../lib')",
     "import rospkg; sys.path.append(rospkg.RosPack().get_path('bench') + '/lib')",
 ]
+TRACED = '''
+import traceback, warnings
+def fail():
+    try: raise KeyError('caught')
+    except KeyError: traceback.print_exc()
+    warnings.warn('odd')
+thread = threading.Thread(target=fail)
+thread.start()
+thread.join()
+'''
 TEXTS = {
     'early': "def read(): open('/no/such.yaml')\nread()",
     'ticks': f'{FAIL}{FAILS[1]}\n{FAILS[2]}\nrospy.spin()',
     'dots': INIT + "sys.stdout.write('half'); sys.stdout.flush(); rospy.spin()",
     'ends': INIT + "sys.stderr.write('last words')",
+    'traced': INIT + TRACED,
     'window': f'def show():\n    import tkinter\n{INIT}rospy.spin()',
 }
 RESPAWNED = '<node pkg="bench" type="dies" name="dies" respawn="true"/>'
@@ -104,6 +115,8 @@ SHOWN = [
     '/window runs as a plain process: it has',
     '[/dots] half',
     '[/ends] last words',
+    "[/traced] KeyError: 'caught'",
+    'UserWarning: odd',
     '/dies has ended, with exit code 4',
     '/dies comes back',
 ]
@@ -729,6 +742,15 @@ def test_closed_output_keeps_what_was_written_before(bench, capfd):
     bench.load(text).wait(TIMEOUT)
     assert 'half a line' in capfd.readouterr().out
     assert bench.said() == ['I/O operation on closed file.']
+
+
+def test_colour_ends_with_its_line():
+    """rospy's log ends it after the end of the line."""
+    texts = []
+    terminal = types.SimpleNamespace(write=texts.append, flush=lambda: None)
+    lines = NamedLines(terminal, types.SimpleNamespace(name='/me'))
+    lines.write('\x1b[31m[ERROR] in vain\n\x1b[0m')
+    assert texts == ['[/me] \x1b[31m[ERROR] in vain\x1b[0m\n']
 
 
 def test_flush_beside_other_threads_loses_nothing():

@@ -386,6 +386,8 @@ class Master:
     ) -> RosProcess:
         """Run a program of ROS as a process at this master, as rosrun does.
 
+        What it prints is in ``output`` of the process, and not shown. ``terminate()`` ends it.
+
         :param args: the program's arguments
         :raises UnknownNodeError: if there is no such program
         """

@@ -233,8 +233,9 @@ class Node(DelegateHolder):
     def restart(self) -> None:
         """Stop and start the node, with the same name, ports, channels and souls.
 
-        Each soul that had not ended begins anew, at its first line. If the node's class has a
-        start() of its own, that one opens the channels and forks the souls instead.
+        Each soul of fork() begins anew, at its first line, unless it had returned by itself. If the
+        node's class has a start() of its own, that one opens the channels and forks the souls
+        instead.
 
         :raises MasterUnreachableError: if the master does not answer; the node runs on
         """
@@ -242,9 +243,7 @@ class Node(DelegateHolder):
             self._check_active()  # raises
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
-            live_souls = [
-                (thread.name, *soul) for thread, soul in list(self._current_run.souls.items())
-            ]
+            former_run = self._current_run
             signals.restarting_nodes.append(self)  # or spin() would return
             try:
                 self.stop()
@@ -252,7 +251,7 @@ class Node(DelegateHolder):
             finally:
                 signals.restarting_nodes.remove(self)
             if not self._has_own_start:
-                for name, block, required in live_souls:
+                for name, block, required in list(former_run.unfinished_souls.values()):
                     Node.fork(self, block, name, required)  # the class may have another fork()
 
     def become(self, node_class: type[Node]) -> None:
@@ -382,7 +381,8 @@ class Node(DelegateHolder):
         name = name or block_name(soul)
         thread = run.Thread(target=self._run_soul, args=[soul, required], name=name)
         # None: a restart runs the soul that the node has then
-        run.souls[thread] = block, required
+        run.unfinished_souls[thread] = name, block, required
+        run.souls.add(thread)
         thread.start()
         return thread
 
@@ -406,7 +406,10 @@ class Node(DelegateHolder):
             self._run_soul(self.soul if is_node_soul else block)  # type: ignore[arg-type]
 
         try:
-            return with_arguments(block, 'soul', 0, 1)(self)
+            value = with_arguments(block, 'soul', 0, 1)(self)
+            if not run.stopping.is_set():
+                run.unfinished_souls.pop(threading.current_thread(), None)
+            return value
         except BaseException as error:
             run.report_failure(error, block, 'soul', retry=retry)
         finally:

@@ -1,13 +1,15 @@
 """Run a group of programs in a process of their own: ``python3 -m pharos.compose.group FILE PARENT``.
 
 A composition starts this program for each of its groups. FILE has the pickled list of entries. The
-environment names the master. The program ends when its programs have ended, when a required one has,
-and when the process PARENT has ended.
+environment names the master; with PHAROS_RELOAD in it, saved files take effect at once. The program
+ends when its programs have ended, when a required one has, and when the process PARENT has ended.
 """
 import os
 import sys
+import threading
 
 from pharos.compose.composition import Composition, leave
+from pharos.compose.control import reload_on_save
 from pharos.compose.roslaunch_parent import receive
 from pharos.master import Master
 
@@ -18,6 +20,8 @@ def main(path: str, parent: int) -> int:
         master = Master(share_connections=os.environ['PHAROS_SHARE_CONNECTIONS'] == '1')
         entries = receive(path, parent)
         with Composition(master, owns_process=True) as composition:
+            if 'PHAROS_RELOAD' in os.environ:
+                threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
             composition.start_entries(entries)
             return composition.wait()
     except KeyboardInterrupt:

@@ -44,8 +44,11 @@ SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread to sleep
 BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
+COLOR_END = '\x1b[0m'  # as rospy writes it
 #: files whose frames tracebacks do not show
 _HIDDEN = '<frozen importlib', loader.__file__, private_classes.__file__, __file__
+
+_local = threading.local()  # sys: the program's own module, in a thread of a program
 
 
 @patch('subprocess', 'Popen.__init__')
@@ -211,7 +214,7 @@ class ScriptRun(Run):
         :raises PharosError: if the program raised an exception before it was a node
         """
         node = self.node
-        self.souls[self.main] = None, False
+        self.souls.add(self.main)
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
         errors = [failure.error for failure in self.failures if failure.block == node.path]
@@ -264,6 +267,7 @@ class ScriptRun(Run):
 
     def run_thread(self, thread: threading.Thread, target: Block) -> None:
         """Run the target of a thread; show and keep its exception."""
+        _local.sys = self.modules.by_name.get('sys')  # None: a stop has not waited for this thread
         try:
             super().run_thread(thread, target)
         except Exception as error:
@@ -609,8 +613,10 @@ class NamedLines:
         """Write the complete lines, keep the rest, and return the number of characters."""
         if self.closed:
             raise ValueError('I/O operation on closed file.')
+        # rospy's log ends a colour after the end of the line: the next line may be that of another node
+        ended_text = text.replace(f'\n{COLOR_END}', f'{COLOR_END}\n')
         with self._lock:  # other threads print, too
-            *lines, self._partial_line = (self._partial_line + text).split('\n')
+            *lines, self._partial_line = (self._partial_line + ended_text).split('\n')
         self._write(lines)
         return len(text)
 
@@ -627,6 +633,23 @@ class NamedLines:
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
             self._stream.flush()
+
+
+class SharedStream:
+    """The process's stdout or stderr, for modules that programs share, such as traceback.
+
+    In a program's thread it is the stream of the program's own sys.
+
+    :param name: 'stdout' or 'stderr'
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._process_sys = types.SimpleNamespace(**{name: getattr(sys, name)})
+
+    def __getattr__(self, attribute: str) -> Any:
+        own_sys = getattr(_local, 'sys', None) or self._process_sys
+        return getattr(getattr(own_sys, self._name), attribute)
 
 
 class _Pharos(Shim):

@@ -43,9 +43,14 @@ class BoundedQueue:
 
     def drop_beyond(self, capacity: int) -> None:
         """Drop the oldest messages, until no more than so many are left."""
-        while len(self.messages) > capacity:
-            with suppress(IndexError):  # the receiver has taken all meanwhile
-                if self.forget(self.messages.popleft()):
+        while self.messages:
+            # the receiver, or another publisher, may take the oldest away in between
+            with suppress(IndexError, ValueError):
+                oldest = self.messages[0]  # before the look: popleft() might take the newest
+                if len(self.messages) <= capacity:
+                    return
+                self.messages.remove(oldest)
+                if self.forget(oldest):
                     self.count_dropped(1)
 
     def count_dropped(self, number: int) -> None:

@@ -44,7 +44,7 @@ def _cpu_seconds(run):
     """Return the CPU time of the node's threads."""
     seconds = run.ended_cpu_seconds
     for thread in list(run.threads):
-        with suppress(OSError):  # the thread ends at this moment
-            if thread.is_alive():
-                seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+        with suppress(OSError, TypeError):  # the thread has ended, or not begun
+            # Linux's number of the clock; pthread_getcpuclockid() reads the memory of a thread that ends
+            seconds += time.clock_gettime(~thread.native_id << 3 | 6)
     return seconds

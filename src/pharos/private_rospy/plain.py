@@ -7,7 +7,7 @@ from pharos.private_rospy.loader import SYSTEM_FOLDERS
 FUNCTIONS = (
     'loginfo logwarn logerr logdebug logfatal loginfo_once logwarn_once logerr_once get_param'
     ' loginfo_throttle logwarn_throttle logerr_throttle get_rostime get_time sleep'
-    ' set_param has_param search_param get_name get_namespace on_shutdown wait_for_message'
+    ' set_param has_param search_param get_name get_namespace on_shutdown spin wait_for_message'
 ).split()
 CLASSES = 'Publisher Subscriber Service ServiceProxy Rate Timer'.split()
 
@@ -24,15 +24,17 @@ def guide(rospy, nodes):
 
     def watch(owner: object, attribute: str, name: str) -> None:
         original = getattr(owner, attribute)
+        definition = vars(owner)[attribute]
 
         def call(*args: object, **kwargs: object) -> object:
             if rospy.core.is_initialized():
-                setattr(owner, attribute, original)  # or the log would name this file
+                setattr(owner, attribute, definition)  # or the log would name this file
             elif nodes():
                 _advise(name)
             return original(*args, **kwargs)
 
-        setattr(owner, attribute, call)
+        is_static = isinstance(definition, staticmethod)
+        setattr(owner, attribute, staticmethod(call) if is_static else call)
 
     def is_shutdown(original=rospy.is_shutdown):
         nonlocal had_nodes
@@ -47,6 +49,7 @@ def guide(rospy, nodes):
         watch(rospy, name, name)
     for name in CLASSES:
         watch(getattr(rospy, name), '__init__', name)
+    watch(rospy.Time, 'now', 'Time.now')
 
 
 def _advise(name: str) -> None:

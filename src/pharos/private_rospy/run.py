@@ -30,7 +30,7 @@ from pharos.private_rospy import connections, patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path, remember_text
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.private_rospy.xmlrpc import ServerProxy
-from pharos.signals import may_be_signal
+from pharos.signals import QuietWait, may_be_signal
 from pharos.transcript import Transcript
 from pharos.waiting import current, let_others_run
 
@@ -97,8 +97,10 @@ class Run:
         self.node = node
         self.settings = settings
         self.failures = Failures()
-        # thread that runs -> its block, None for the node's soul, and True if it is required
-        self.souls: dict[threading.Thread, tuple[Any, bool]] = {}
+        self.souls: set[threading.Thread] = set()  # that run
+        # thread of fork() -> name, block, required, until the soul has returned before a stop; a
+        # restart forks these
+        self.unfinished_souls: dict[threading.Thread, tuple] = {}
         # names, the newest last
         self.ended_souls: collections.deque[str] = collections.deque(maxlen=10)
         self.endpoints = []  # also those that the stop has closed, for the next start
@@ -179,7 +181,8 @@ class Run:
 
     def mark_ended(self, soul_thread: threading.Thread) -> None:
         """Keep the name of a soul that has ended; do nothing for another thread."""
-        if self.souls.pop(soul_thread, None):
+        if soul_thread in self.souls:
+            self.souls.discard(soul_thread)
             self.ended_souls.append(soul_thread.name)
 
     def start_thread(self, target: Callable) -> threading.Thread | None:
@@ -210,8 +213,9 @@ class Run:
         if seconds <= 0:
             let_others_run()
             return
-        is_stopping = self.stopping.wait(seconds)
-        if is_stopping:
+        with QuietWait():  # a loop of the main thread ends by is_shutdown(), as in a process
+            self.stopping.wait(seconds)
+        if self.stopping.is_set():
             is_timer = isinstance(threading.current_thread(), self.ros.Timer)
             if is_timer or current.service_run is self:
                 raise SystemExit(f'{self.name} stops')
@@ -472,7 +476,7 @@ class Run:
 
 def items_of(weak_set: WeakSet) -> list:
     """Return what is in a set; other threads may add to it meanwhile, which list() would not bear."""
-    references = list(weak_set.data)  # in C: no other thread runs in between
+    references = list(weak_set.data)  # type: ignore  # in C: no other thread runs in between
     return [item for item in (reference() for reference in references) if item is not None]
 
 

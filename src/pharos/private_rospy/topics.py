@@ -242,7 +242,7 @@ class PlainInbox(Inbox):
 
     def __init__(self, subscription: Any, first_pause: float) -> None:
         callback_queue = CallbackQueue(subscription.run.callback_queue.order, first_pause)
-        super().__init__(callback_queue, subscription.call_plain, subscription.queue_size)
+        super().__init__(callback_queue, subscription.call_plain)
         self.subscription = subscription
         self.queue_bytes = subscription.run.node.queue_bytes
 
@@ -342,6 +342,9 @@ class SubscriptionOverlay:
             if len(inboxes) < len(callbacks):
                 if not self.plain_inbox:
                     self.plain_inbox = PlainInbox(self, first_pause_for(callbacks))
+                self.plain_inbox.queue_size = (
+                    self.queue_size
+                )  # the last Subscriber that has one sets it
                 inboxes.append(self.plain_inbox)
             self.inboxes[:] = inboxes  # the links have this very list
             links = links_of(self.connections)
