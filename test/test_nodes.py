@@ -350,11 +350,12 @@ def test_every_and_sleep_follow_ros_time(master):
 def test_ended_soul_is_not_run_again(node):
     ran, begun = [], threading.Semaphore(0)
     node.fork(lambda me: ran.append(1)).join(TIMEOUT)
+    node.fork(lambda me: ran.append(1) or 1 / 0).join(TIMEOUT)  # a job of that time
     node.fork(lambda me: (begun.release(), me.sleep(3600)))
     assert begun.acquire(timeout=TIMEOUT)
     node.restart()
     assert begun.acquire(timeout=TIMEOUT)
-    assert ran == [1]
+    assert ran == [1, 1]
 
 
 @pytest.mark.parametrize('end', ['raises', 'stops', 'stops by itself'])

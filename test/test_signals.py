@@ -196,15 +196,13 @@ def test_ignored_interrupt_is_taken(program):
     assert running.wait() == ended_by(signal.SIGINT)
 
 
-@pytest.mark.parametrize('sleep', ['me.sleep', 'me.ros.sleep', 'wait'])
-def test_loop_in_the_manner_of_rospy_ends_by_its_condition(program, sleep):
+def test_loop_in_the_manner_of_rospy_ends_by_its_condition(program):
     text = '''
-def wait(seconds): me.ros.Rate(1 / seconds).sleep()
 ready_when_asleep()
 while not me.ros.is_shutdown():
-    SLEEP(1)
+    me.sleep(1)
 print('motors are off')'''
-    running = program(BEGIN + text.replace('SLEEP', sleep))
+    running = program(BEGIN + text)
     running.signal(signal.SIGINT)
     assert running.wait() == 0, running.output
     assert 'motors are off' in running.output

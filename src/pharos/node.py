@@ -233,9 +233,9 @@ class Node(DelegateHolder):
     def restart(self) -> None:
         """Stop and start the node, with the same name, ports, channels and souls.
 
-        Each soul of fork() begins anew, at its first line, unless it had returned by itself. If the
-        node's class has a start() of its own, that one opens the channels and forks the souls
-        instead.
+        Each soul that had not ended before the stop begins anew, at its first line; so does the node's
+        :attr:`soul` if it had failed. If the node's class has a start() of its own, that one opens the
+        channels and forks the souls instead.
 
         :raises MasterUnreachableError: if the master does not answer; the node runs on
         """
@@ -244,6 +244,7 @@ class Node(DelegateHolder):
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
             former_run = self._current_run
+            live_souls = list(former_run.souls.values())
             signals.restarting_nodes.append(self)  # or spin() would return
             try:
                 self.stop()
@@ -251,7 +252,11 @@ class Node(DelegateHolder):
             finally:
                 signals.restarting_nodes.remove(self)
             if not self._has_own_start:
-                for name, block, required in list(former_run.unfinished_souls.values()):
+                names = [name for name, *_ in live_souls]
+                broken_souls = [
+                    each for each in former_run.broken_souls.values() if each[0] not in names
+                ]
+                for name, block, required in live_souls + broken_souls:
                     Node.fork(self, block, name, required)  # the class may have another fork()
 
     def become(self, node_class: type[Node]) -> None:
@@ -379,10 +384,9 @@ class Node(DelegateHolder):
         soul = self._check_soul(block or self.soul)
         run = self._current_run
         name = name or block_name(soul)
-        thread = run.Thread(target=self._run_soul, args=[soul, required], name=name)
-        # None: a restart runs the soul that the node has then
-        run.unfinished_souls[thread] = name, block, required
-        run.souls.add(thread)
+        entry = name, block, required  # None: a restart runs the soul that the node has then
+        thread = run.Thread(target=self._run_soul, args=[soul, required, entry], name=name)
+        run.souls[thread] = entry
         thread.start()
         return thread
 
@@ -394,7 +398,7 @@ class Node(DelegateHolder):
         self._has_run_soul = True
         return block  # type: ignore[return-value]
 
-    def _run_soul(self, block: Block, required: bool = False) -> Any:
+    def _run_soul(self, block: Block, required: bool = False, entry: Any = None) -> Any:
         run = self._current_run  # a restart makes another one
         former = current.node, current.run
         current.node = self
@@ -407,13 +411,16 @@ class Node(DelegateHolder):
 
         try:
             value = with_arguments(block, 'soul', 0, 1)(self)
-            if not run.stopping.is_set():
-                run.unfinished_souls.pop(threading.current_thread(), None)
+            if entry and not run.stopping.is_set():  # it has returned by itself
+                run.broken_souls.pop(entry[0], None)
+                entry = None
             return value
         except BaseException as error:
             run.report_failure(error, block, 'soul', retry=retry)
         finally:
             current.node, current.run = former
+            if entry and (run.stopping.is_set() or entry[1] is None):
+                run.broken_souls[entry[0]] = entry
             if required and not run.stopping.is_set():
                 self.log(f'stops: {block_name(block)}, which is required, has ended', 'error')
                 signals.lost_names.add(self._settings.name)

@@ -136,7 +136,7 @@ def _run(stack, options, mappings):
         stack.enter_context(Master.embedded(port))
     composition = stack.enter_context(Composition(master, owns_process=True))
     if options.reload:  # also what is saved while the programs start
-        composition.environment['PHAROS_RELOAD'] = '1'  # for groups
+        composition.reloads = True
         threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))

@@ -26,7 +26,7 @@ from pharos.compose import control, roslaunch_parent
 from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose.launch_file import Entry, LaunchFile
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
-from pharos.compose.script_run import SharedStream
+from pharos.compose.script_run import SharedStderr
 from pharos.compose.sources import (
     environment_of,
     needs_process,
@@ -74,6 +74,8 @@ class Composition:
     :ivar stopping: an Event, set when the end has begun
     """
 
+    reloads = False  # True: what is saved takes effect, also in groups
+
     def __init__(self, master: Master, owns_process: bool = False) -> None:
         self.master = master
         self.owns_process = owns_process
@@ -92,7 +94,7 @@ class Composition:
         if owns_process:
             faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
             sys.setswitchinterval(SWITCH_INTERVAL)
-            sys.stdout, sys.stderr = SharedStream('stdout'), SharedStream('stderr')  # type: ignore
+            sys.stderr = SharedStderr()  # type: ignore
 
     def launch(self, launch_file: LaunchFile) -> None:
         """Set the parameters of a launch file, and start its nodes.
@@ -207,6 +209,7 @@ class Composition:
             f'PYTHONPATH={os.pathsep.join(folder for folder in folders if folder)}',
             f'PHAROS_SHARED_MEMORY={int(self.master.shared_memory)}',
             f'PHAROS_SHARE_CONNECTIONS={int(self.master.share_connections)}',
+            f'PHAROS_RELOAD={int(self.reloads)}',
             sys.executable,
             '-m',
             'pharos.compose.group',

@@ -1,7 +1,7 @@
 """Run a group of programs in a process of their own: ``python3 -m pharos.compose.group FILE PARENT``.
 
 A composition starts this program for each of its groups. FILE has the pickled list of entries. The
-environment names the master; with PHAROS_RELOAD in it, saved files take effect at once. The program
+environment names the master; with PHAROS_RELOAD=1, saved files take effect at once. The program
 ends when its programs have ended, when a required one has, and when the process PARENT has ended.
 """
 import os
@@ -20,7 +20,7 @@ def main(path: str, parent: int) -> int:
         master = Master(share_connections=os.environ['PHAROS_SHARE_CONNECTIONS'] == '1')
         entries = receive(path, parent)
         with Composition(master, owns_process=True) as composition:
-            if 'PHAROS_RELOAD' in os.environ:
+            if os.environ.pop('PHAROS_RELOAD') == '1':
                 threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
             composition.start_entries(entries)
             return composition.wait()

@@ -48,7 +48,7 @@ COLOR_END = '\x1b[0m'  # as rospy writes it
 #: files whose frames tracebacks do not show
 _HIDDEN = '<frozen importlib', loader.__file__, private_classes.__file__, __file__
 
-_local = threading.local()  # sys: the program's own module, in a thread of a program
+_local = threading.local()  # stderr: that of the program, in its threads
 
 
 @patch('subprocess', 'Popen.__init__')
@@ -214,7 +214,7 @@ class ScriptRun(Run):
         :raises PharosError: if the program raised an exception before it was a node
         """
         node = self.node
-        self.souls.add(self.main)
+        self.souls[self.main] = self.name, None, False
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
         errors = [failure.error for failure in self.failures if failure.block == node.path]
@@ -267,7 +267,7 @@ class ScriptRun(Run):
 
     def run_thread(self, thread: threading.Thread, target: Block) -> None:
         """Run the target of a thread; show and keep its exception."""
-        _local.sys = self.modules.by_name.get('sys')  # None: a stop has not waited for this thread
+        _local.stderr = self.stderr
         try:
             super().run_thread(thread, target)
         except Exception as error:
@@ -635,21 +635,14 @@ class NamedLines:
             self._stream.flush()
 
 
-class SharedStream:
-    """The process's stdout or stderr, for modules that programs share, such as traceback.
+class SharedStderr:
+    """The process's stderr, for modules that programs share, such as traceback and warnings.
 
-    In a program's thread it is the stream of the program's own sys.
-
-    :param name: 'stdout' or 'stderr'
+    In a program's thread it is the stderr that the program began with.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._process_sys = types.SimpleNamespace(**{name: getattr(sys, name)})
-
     def __getattr__(self, attribute: str) -> Any:
-        own_sys = getattr(_local, 'sys', None) or self._process_sys
-        return getattr(getattr(own_sys, self._name), attribute)
+        return getattr(getattr(_local, 'stderr', sys.__stderr__), attribute)
 
 
 class _Pharos(Shim):

@@ -30,7 +30,7 @@ from pharos.private_rospy import connections, patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path, remember_text
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.private_rospy.xmlrpc import ServerProxy
-from pharos.signals import QuietWait, may_be_signal
+from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
 from pharos.waiting import current, let_others_run
 
@@ -97,10 +97,11 @@ class Run:
         self.node = node
         self.settings = settings
         self.failures = Failures()
-        self.souls: set[threading.Thread] = set()  # that run
-        # thread of fork() -> name, block, required, until the soul has returned before a stop; a
-        # restart forks these
-        self.unfinished_souls: dict[threading.Thread, tuple] = {}
+        # thread that runs -> name; block, None for the node's soul; True if it is required
+        self.souls: dict[threading.Thread, tuple[str, Any, bool]] = {}
+        # name -> the same, of those that the stop has ended, and of the node's soul if it has failed;
+        # a restart forks them, too
+        self.broken_souls: dict[str, tuple[str, Any, bool]] = {}
         # names, the newest last
         self.ended_souls: collections.deque[str] = collections.deque(maxlen=10)
         self.endpoints = []  # also those that the stop has closed, for the next start
@@ -181,8 +182,7 @@ class Run:
 
     def mark_ended(self, soul_thread: threading.Thread) -> None:
         """Keep the name of a soul that has ended; do nothing for another thread."""
-        if soul_thread in self.souls:
-            self.souls.discard(soul_thread)
+        if self.souls.pop(soul_thread, None):
             self.ended_souls.append(soul_thread.name)
 
     def start_thread(self, target: Callable) -> threading.Thread | None:
@@ -213,9 +213,8 @@ class Run:
         if seconds <= 0:
             let_others_run()
             return
-        with QuietWait():  # a loop of the main thread ends by is_shutdown(), as in a process
-            self.stopping.wait(seconds)
-        if self.stopping.is_set():
+        is_stopping = self.stopping.wait(seconds)
+        if is_stopping:
             is_timer = isinstance(threading.current_thread(), self.ros.Timer)
             if is_timer or current.service_run is self:
                 raise SystemExit(f'{self.name} stops')

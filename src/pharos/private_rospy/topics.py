@@ -342,9 +342,8 @@ class SubscriptionOverlay:
             if len(inboxes) < len(callbacks):
                 if not self.plain_inbox:
                     self.plain_inbox = PlainInbox(self, first_pause_for(callbacks))
-                self.plain_inbox.queue_size = (
-                    self.queue_size
-                )  # the last Subscriber that has one sets it
+                # the last Subscriber that has one sets it
+                self.plain_inbox.queue_size = self.queue_size
                 inboxes.append(self.plain_inbox)
             self.inboxes[:] = inboxes  # the links have this very list
             links = links_of(self.connections)
