@@ -89,22 +89,11 @@ FOLDERS = [
     "sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)) + '/../lib')",
     "import rospkg; sys.path.append(rospkg.RosPack().get_path('bench') + '/lib')",
 ]
-TRACED = '''
-import traceback, warnings
-def fail():
-    try: raise KeyError('caught')
-    except KeyError: traceback.print_exc()
-    warnings.warn('odd')
-thread = threading.Thread(target=fail)
-thread.start()
-thread.join()
-'''
 TEXTS = {
     'early': "def read(): open('/no/such.yaml')\nread()",
     'ticks': f'{FAIL}{FAILS[1]}\n{FAILS[2]}\nrospy.spin()',
     'dots': INIT + "sys.stdout.write('half'); sys.stdout.flush(); rospy.spin()",
     'ends': INIT + "sys.stderr.write('last words')",
-    'traced': INIT + TRACED,
     'window': f'def show():\n    import tkinter\n{INIT}rospy.spin()',
 }
 RESPAWNED = '<node pkg="bench" type="dies" name="dies" respawn="true"/>'
@@ -115,8 +104,6 @@ SHOWN = [
     '/window runs as a plain process: it has',
     '[/dots] half',
     '[/ends] last words',
-    "[/traced] KeyError: 'caught'",
-    'UserWarning: odd',
     '/dies has ended, with exit code 4',
     '/dies comes back',
 ]

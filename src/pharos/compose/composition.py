@@ -26,7 +26,6 @@ from pharos.compose import control, roslaunch_parent
 from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose.launch_file import Entry, LaunchFile
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
-from pharos.compose.script_run import SharedStderr
 from pharos.compose.sources import (
     environment_of,
     needs_process,
@@ -94,7 +93,6 @@ class Composition:
         if owns_process:
             faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
             sys.setswitchinterval(SWITCH_INTERVAL)
-            sys.stderr = SharedStderr()  # type: ignore
 
     def launch(self, launch_file: LaunchFile) -> None:
         """Set the parameters of a launch file, and start its nodes.

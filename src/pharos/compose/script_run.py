@@ -48,8 +48,6 @@ COLOR_END = '\x1b[0m'  # as rospy writes it
 #: files whose frames tracebacks do not show
 _HIDDEN = '<frozen importlib', loader.__file__, private_classes.__file__, __file__
 
-_local = threading.local()  # stderr: that of the program, in its threads
-
 
 @patch('subprocess', 'Popen.__init__')
 def start_child(
@@ -267,7 +265,6 @@ class ScriptRun(Run):
 
     def run_thread(self, thread: threading.Thread, target: Block) -> None:
         """Run the target of a thread; show and keep its exception."""
-        _local.stderr = self.stderr
         try:
             super().run_thread(thread, target)
         except Exception as error:
@@ -633,16 +630,6 @@ class NamedLines:
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
             self._stream.flush()
-
-
-class SharedStderr:
-    """The process's stderr, for modules that programs share, such as traceback and warnings.
-
-    In a program's thread it is the stderr that the program began with.
-    """
-
-    def __getattr__(self, attribute: str) -> Any:
-        return getattr(getattr(_local, 'stderr', sys.__stderr__), attribute)
 
 
 class _Pharos(Shim):
