@@ -572,7 +572,6 @@ STOPPED = {
     'every': lambda node: list(node.every(0.01)),
     'wait_for_message': lambda node: node.wait_for_message('/a', STRING, 0.01),
     'lookup_service': lambda node: node.lookup_service('/a'),
-    'ros': lambda node: node.ros,
     'ros_import': lambda node: node.ros_import('message_filters'),
 }
 
@@ -583,6 +582,24 @@ def test_stopped_node_refuses_use(node):
     for use in STOPPED.values():
         with pytest.raises(NodeStoppedError, match='/node'):
             use(node)
+    assert node.ros.is_shutdown()  # or a loop on it would not get to its last lines
+
+
+def test_node_without_a_start_has_no_rospy(master):
+    class Early(Node):
+        def __init__(self):
+            self.is_over = self.ros.is_shutdown()
+
+    with pytest.raises(NodeStoppedError):
+        create(master, node_class=Early)
+
+
+def test_channel_of_a_stopped_node_stays_closed(node):
+    channel = node.output_channel('/words', STRING)
+    node.stop()
+    with pytest.raises(NodeStoppedError, match='/node'):
+        channel.open()
+    assert channel.closed
 
 
 def test_restarted_node_hears_no_old_message(master):

@@ -200,7 +200,9 @@ def test_loop_in_the_manner_of_rospy_ends_by_its_condition(program):
     text = '''
 ready_when_asleep()
 while not me.ros.is_shutdown():
-    me.sleep(1)
+    me.sleep(3600)
+    while me.lifecycle is not pharos.Lifecycle.STOPPED:  # the end of a long turn
+        threading.Event().wait(0.01)
 print('motors are off')'''
     running = program(BEGIN + text)
     running.signal(signal.SIGINT)

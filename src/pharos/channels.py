@@ -64,6 +64,7 @@ class Endpoint:
 
         :raises MasterUnreachableError: if the master does not answer
         """
+        self.node._check_active()
         is_closed_again = self._open()
         if not is_closed_again:
             self._run.endpoints.append(self)  # in place: another thread may open or close one, too

@@ -320,8 +320,12 @@ class Node(DelegateHolder):
 
     @property
     def ros(self) -> Any:
-        """The node's own rospy, such as ``node.ros.Timer``; each run has another one."""
-        self._check_active()
+        """The node's own rospy, such as ``node.ros.Timer``; each run has another one.
+
+        After a stop it is the last run's, whose ``is_shutdown()`` is True: a loop on it ends.
+        """
+        if not self._current_run:
+            self._check_active()  # raises
         return self._current_run.ros
 
     def ros_import(self, name: str) -> Any:
