@@ -71,6 +71,26 @@ def test_signal_to_its_own_process_ends_the_program_alone(bench, number):
     until(lambda: not script.is_running)
 
 
+@pytest.mark.parametrize('rest', ['', 'rospy.spin()'], ids=['by itself', 'by a stop'])
+def test_print_in_a_destructor_at_the_end(bench, capfd, rest):
+    """As of a driver whose __del__ prints, and turns its motor off."""
+    text = f"""
+        class Motor:
+            def __del__(self):
+                print('motor off')
+                say('off')
+        rospy.init_node('program')
+        motor = Motor()
+        say('on')
+        {rest}
+        """
+    script = bench.load(text)
+    bench.until(bench.said)
+    script.stop()
+    bench.until(lambda: bench.said() == ['on', 'off'])
+    assert '[/program] motor off\n' in capfd.readouterr().out
+
+
 def test_hook_that_raises_is_printed_and_kept(bench, capfd):
     text = '''
         def hook(): return 1 / 0

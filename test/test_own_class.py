@@ -188,6 +188,61 @@ def test_node_whose_own_stop_fails_is_stopped(master):
     assert [type(error) for error in node.errors] == [AssertionError]
 
 
+def drive_on(me):
+    """Drive after the stop has sent its zero, as a block that computes meanwhile does."""
+    me.begun.set()
+    assert me.zeroed.wait(TIMEOUT)
+    me.log('drives on')
+    me.send_to('/speed', typed_as=STRING, data='on')
+    me.send_to('/diary', typed_as=STRING, data='drove on')
+    me.drove.set()
+
+
+WORK = {
+    'soul': lambda me: me.fork(drive_on),
+    'delegate': lambda me: me.interested_in('/go', STRING, lambda message: drive_on(me)),
+    'timer': lambda me: me.ros.Timer(me.ros.Duration(0.001), lambda event: drive_on(me), True),
+    'thread': lambda me: threading.Thread(target=drive_on, args=[me], daemon=True).start(),
+}
+
+
+@pytest.mark.parametrize('way', ['stop', 'hook'])
+@pytest.mark.parametrize('work', WORK)
+def test_stop_has_the_last_word(master, sender, other, way, work):
+    class Robot(Node):
+        stop_timeout = 0.01
+
+        def start(self):
+            super().start()
+            self.begun, self.zeroed, self.drove = [threading.Event() for _ in range(3)]
+            self.send_to('/speed', typed_as=STRING, data='first')
+            self.send_to('/diary', typed_as=STRING, data='first')
+            if way == 'hook':
+                self.ros.on_shutdown(self.halt)
+            WORK[work](self)
+
+        def halt(self):
+            self.log('halts')
+            self.send_to('/speed', typed_as=STRING, data='zero')
+            self.zeroed.set()
+            self.drove.wait(TIMEOUT)
+
+        def stop(self):
+            if way == 'stop':
+                self.halt()
+            super().stop()
+
+    speeds, diary = Mailbox(other, '/speed', STRING), Mailbox(other, '/diary', STRING)
+    log = Mailbox(other, '/rosout', 'rosgraph_msgs/Log')
+    robot = create(master, '/robot', Robot)
+    sender.send_to('/go', typed_as=STRING, data='go')
+    assert robot.begun.wait(TIMEOUT)
+    robot.stop()
+    diary.wait_for(lambda message: message.data == 'drove on')
+    log.wait_for(lambda message: message.msg == 'drives on')
+    assert [each.data for each in speeds.all()] == ['first', 'zero']
+
+
 def test_node_becomes_another_class_after_the_delegate(master):
     ear, gate, _, _ = fill(master)
     former_class = type(ear)

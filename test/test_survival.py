@@ -553,13 +553,14 @@ def test_silent_master_is_told_in_one_line(mortal, capfd):
     assert mortal.url in line
 
 
-def test_master_that_goes_away_is_told_and_keeps_its_nodes(mortal, capfd):
+def test_master_that_goes_away_is_told_and_keeps_its_nodes(mortal):
     node = create(mortal.master)
+    log = Mailbox(node, '/rosout', 'rosgraph_msgs/Log')
     mortal.end()
     with pytest.raises(pharos.MasterUnreachableError):
         node.restart()
     assert node.is_running
-    until(lambda: 'no master answers at' in capfd.readouterr().err)
+    log.wait_for(lambda line: 'no master answers at' in line.msg)
 
 
 def test_stop_at_a_hanging_master_closes_connections(mortal):
@@ -971,7 +972,7 @@ def test_failed_look_costs_no_other_node(master, monkeypatch, quick_watcher, wha
     until(lambda: '/victim' in master.topic('/rosout').publishers)
 
 
-def test_failed_connection_is_told_and_made_again(master, monkeypatch, quick_watcher, capfd):
+def test_failed_connection_is_told_and_made_again(master, monkeypatch, quick_watcher):
     """Whatever the error is."""
     link, calls = connections.link_topic, []
 
@@ -981,27 +982,20 @@ def test_failed_connection_is_told_and_made_again(master, monkeypatch, quick_wat
             raise RuntimeError('this attempt fails')
         link(*arguments)
 
+    ear = create(master, '/ear')
+    log = Mailbox(ear, '/rosout', 'rosgraph_msgs/Log')
     monkeypatch.setattr(connections, 'link_topic', fail_once)
-    box = Mailbox(create(master, '/ear'), '/words', STRING)
+    box = Mailbox(ear, '/words', STRING)
     create(master, '/mouth').send_to('/words', typed_as=STRING, data='x')
     assert box.next().data == 'x'
-    output = []
-    until(lambda: output.extend(capfd.readouterr()) or 'this attempt fails' in ''.join(output))
+    log.wait_for(lambda line: 'this attempt fails' in line.msg)
 
 
-def test_failed_look_is_told_once(master, monkeypatch, quick_watcher, capfd):
+def test_failed_look_is_told_once(master, monkeypatch, quick_watcher, transcript):
     monkeypatch.setattr('pharos.transcript._shown_keys', set())  # of other tests
     calls = break_look(monkeypatch, create(master)._current_run, 'silent clients')
-    output = []
-
-    def lines():
-        output.extend(capfd.readouterr())
-        return [line for line in ''.join(output).splitlines() if 'this look fails' in line]
-
-    until(lines)
-    count = len(calls)
-    until(lambda: len(calls) > count + 10)
-    assert len(lines()) == 1
+    until(lambda: len(calls) > 10)
+    assert len([text for text in transcript if 'this look fails' in text]) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -324,7 +325,8 @@ class OutputChannel(Channel):
         """
         if not self.closed:
             self._publisher.latches.pop(self, None)
-            self._publisher.flush_for_last(self.node.stop_timeout)
+            if self._publisher.ref_count == 1:  # the last one closes the topic
+                self._publisher.flush(time.monotonic() + self.node.stop_timeout)
         super().close()
 
     def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:

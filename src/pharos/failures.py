@@ -25,7 +25,7 @@ class Failure:
 
     count = 1
 
-    def __init__(self, error, block, message, channel, retry):
+    def __init__(self, error, block, message=None, channel=None, retry=None):
         self.error = error
         self.block = block
         self.message = message

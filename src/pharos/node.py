@@ -108,12 +108,18 @@ class Node(DelegateHolder):
         )
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Have the stop() of a class say so if it does not call that of Node."""
+        """Have the stop() of a class run only if there is something to stop, and have the last word.
+
+        It says so if it does not call that of Node.
+        """
         super().__init_subclass__(**options)
         own_stop: Any = vars(cls).get('stop')
         if own_stop:
 
             def stop(self: Node, *args: Any, **kwargs: Any) -> Any:
+                if not self._is_active:
+                    return None
+                self._current_run.last_thread = threading.get_ident()
                 value = own_stop(self, *args, **kwargs)
                 if self.is_running:
                     self.log(f'{cls.__name__}.stop() must call super().stop()', 'error')
@@ -294,11 +300,16 @@ class Node(DelegateHolder):
 
     def _check_active(self) -> None:
         """Raise NodeStoppedError if the node has not started, or has stopped."""
-        if not (self._current_run and self._current_run.is_active):
+        if not self._is_active:
             raise NodeStoppedError(
                 f'{self._settings.name} is {self.lifecycle.value}: start() it,'
                 ' by super() in a class of your own'
             )
+
+    @property
+    def _is_active(self) -> bool:
+        """True if the node runs, or its stop goes on."""
+        return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
 
     @property
     def is_running(self) -> bool:
@@ -491,10 +502,9 @@ class Node(DelegateHolder):
         """
         if level not in ('debug', 'info', 'warn', 'warning', 'error', 'fatal'):
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
-        run = self._current_run
-        if run and run.is_active:
+        if self._is_active:
             # called from here, not from a helper: rospy logs the caller of this method
-            run.ros.core._base_logger('%s', (text,), {}, level=level)
+            self._current_run.ros.core._base_logger('%s', (text,), {}, level=level)
         else:
             Transcript.show(f'[{level.upper()}] {self._settings.name}: {text}')
 
@@ -696,8 +706,7 @@ class Node(DelegateHolder):
     @property
     def _parameters(self) -> list[Parameter]:
         """The parameters that :meth:`parameter` has returned."""
-        endpoints = list(self._current_run.endpoints)
-        return [endpoint for endpoint in endpoints if isinstance(endpoint, Parameter)]
+        return self._current_run.open_endpoints(Parameter)
 
 
 class BlockNode(Node):

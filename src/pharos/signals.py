@@ -41,16 +41,13 @@ def live_nodes():
     return [node for node in started_nodes if not node._current_run.stopping.is_set()]
 
 
-class QuietWait:
+class QuietWait(contextlib.AbstractContextManager):
     """Ends the wait in a ``with`` without an exception if a node stops or a signal stops all nodes.
 
     Other KeyboardInterrupts and SystemExits go on. (contextlib.contextmanager would raise a
     RuntimeError for a signal that comes before its ``yield``.) Who waits then looks for the stop:
     sleep() and every() at the run's ``stopping``; spin() stops all nodes.
     """
-
-    def __enter__(self) -> None:
-        pass
 
     def __exit__(
         self, error_class: type | None, error: BaseException | None, trace: object

@@ -102,9 +102,10 @@ class ScriptRun(Run):
         folder = os.path.dirname(os.path.realpath(node.path))
         self.path.insert(0, folder)
         self.modules.program_folder = folder
-        self.modules.by_name['sys'].modules = collections.ChainMap(
-            self.modules.by_name, sys.modules
-        )
+        self.own_sys = self.modules.by_name[
+            'sys'
+        ]  # the table is empty at the end, when a __del__ prints
+        self.own_sys.modules = collections.ChainMap(self.modules.by_name, sys.modules)
         self.modules.builtins.update(print=self.print, exit=sys.exit, quit=sys.exit)
         self.ros.init_node = self.init_node
 
@@ -187,7 +188,7 @@ class ScriptRun(Run):
 
     def print(self, *values: object, file: Any = None, **options: Any) -> None:
         """Stand in for ``print``: write to the program's own sys.stdout, not to the process's."""
-        print(*values, file=file or self.modules.by_name['sys'].stdout, **options)
+        print(*values, file=file or self.own_sys.stdout, **options)
 
     def print_error(
         self, error_class: Any, error: BaseException, trace: Any, title: str = ''
@@ -286,7 +287,6 @@ class ScriptRun(Run):
         vars(main_module)['__builtins__'] = self.modules.builtins
         self.modules.by_name['__main__'] = main_module
         status = 1  # stays if the program's own sys.excepthook raises an exception
-        own_sys = self.modules.by_name['sys']  # a stop that has not waited takes it away
         try:
             status = self._run_code(code, vars(main_module))
             self._run_all(self.thread_exit_functions, -1)
@@ -294,7 +294,7 @@ class ScriptRun(Run):
             # rospy's own function was the first to be registered, and comes last
             self._run_all(self.exit_functions, -1)
         finally:
-            for stream in own_sys.stdout, own_sys.stderr, self.stdout, self.stderr:
+            for stream in self.own_sys.stdout, self.own_sys.stderr, self.stdout, self.stderr:
                 with contextlib.suppress(Exception):  # the program has closed it, or given it away
                     stream.flush()
             if self.node._current_run is self:  # else the node has started again before this end
@@ -317,7 +317,7 @@ class ScriptRun(Run):
             trace = error.__traceback__
             if isinstance(error, NodeNameInUseError):  # the text says all
                 trace = None
-            self.modules.by_name['sys'].excepthook(type(error), error, trace)
+            self.own_sys.excepthook(type(error), error, trace)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
             self.keep_failure(error, self.node.path)

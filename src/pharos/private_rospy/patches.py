@@ -298,11 +298,9 @@ def shut_down_from_outside(
         obeys = True
     if caller_id == '/master' and f'[{self.name}]' not in str(msg):
         obeys = False  # the call is for an earlier node, which had this URI
-    if obeys:
-        run.ros.logwarn(f'stops for {caller_id} at {host}: {msg}')
-        _current_client.must_stop = True
-    else:
-        run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
+    _current_client.must_stop = obeys
+    verb = 'stops' if obeys else 'does not stop'
+    run.ros.logwarn(f'{verb} for {caller_id} at {host}: {msg}')
     return int(obeys), '' if obeys else 'only this host and the master may do that', 0
 
 

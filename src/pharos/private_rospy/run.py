@@ -89,6 +89,9 @@ class Run:
     uri = ''  # of the XML-RPC server; '' until the server runs
     lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
+    # the thread that runs the stop() of the node's class, or rospy's hooks: on a topic that it has
+    # published to, the node's other threads publish no more, or a robot would drive on
+    last_thread: int | None = None
     rospy_signal_shutdown: Callable
     Thread: type[threading.Thread]  # made by substitutes()
     ros_handler: Any
@@ -239,11 +242,6 @@ class Run:
         """The node's Master."""
         return self.settings.master
 
-    @property
-    def is_active(self) -> bool:
-        """True if the node runs, or its stop goes on."""
-        return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
-
     def health_facts(self) -> dict[str, Any]:
         """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
         from pharos.live.health import facts_of
@@ -309,16 +307,12 @@ class Run:
                 if Transcript.receiver:  # else it would stand on the terminal twice
                     Transcript.show(text)
 
-    def keep_failure(
-        self,
-        error: BaseException,
-        block: Any,
-        message: Any = None,
-        channel: Any = None,
-        retry: Callable | None = None,
-    ) -> Failure:
-        """Keep an exception of a block, without a log line, and return the Failure."""
-        failure = Failure(error, block, message, channel, retry)
+    def keep_failure(self, error: BaseException, block: Any, *details: Any) -> Failure:
+        """Keep an exception of a block, without a log line, and return the Failure.
+
+        :param details: the message, channel and retry of the Failure
+        """
+        failure = Failure(error, block, *details)
         self.failures.keep(failure)
         return failure
 
@@ -422,6 +416,7 @@ class Run:
         deadline = time.monotonic() + timeout
         for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
+        self.last_thread = threading.get_ident()
         self.rospy_signal_shutdown('stop')
 
     def _begin_stop(self) -> None:

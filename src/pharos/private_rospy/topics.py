@@ -47,6 +47,7 @@ class PublisherOverlay:
     def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
+        self.has_last_word = False  # True once Run.last_thread has published
         # channel, or None for all Publishers of plain rospy -> frozen message. add_connection(),
         # link_topic() and add_callback() hand them to what is new, OutputChannel.open() its own to the
         # next run; its close() drops it
@@ -135,6 +136,12 @@ class PublisherOverlay:
             # looked at under the lock: so what the handler publishes to this topic comes last
             if silenced_threads and get_ident() in silenced_threads and self.name != '/rosout':
                 return
+            last_thread = self.run.last_thread
+            if last_thread and self.name != '/rosout':
+                if last_thread == get_ident():
+                    self.has_last_word = True
+                elif self.has_last_word:
+                    return
             if self.closed:
                 # rospy's publish() returns in this case, too
                 if channel is None and self.run.stopping.is_set():
@@ -219,14 +226,6 @@ class PublisherOverlay:
             if time.monotonic() > deadline:
                 break
             time.sleep(FLUSH_PERIOD)
-
-    def flush_for_last(self, timeout: float) -> None:
-        """Flush if only one Publisher is left: its end closes the topic.
-
-        :param timeout: seconds
-        """
-        if self.ref_count == 1:
-            self.flush(time.monotonic() + timeout)
 
     def close(self) -> None:
         close_topic(self)
