@@ -731,19 +731,44 @@ def test_closed_output_keeps_what_was_written_before(bench, capfd):
     assert bench.said() == ['I/O operation on closed file.']
 
 
+def stream(is_terminal=False, flush=lambda: None):
+    """Return a stream that keeps texts, and the list of these."""
+    texts = []
+    methods = {'write': texts.append, 'flush': flush, 'isatty': lambda: is_terminal}
+    return types.SimpleNamespace(**methods), texts
+
+
+def lines_of(name, screen):
+    return NamedLines(screen, types.SimpleNamespace(name=name))
+
+
 def test_colour_ends_with_its_line():
     """rospy's log ends it after the end of the line."""
-    texts = []
-    terminal = types.SimpleNamespace(write=texts.append, flush=lambda: None)
-    lines = NamedLines(terminal, types.SimpleNamespace(name='/me'))
-    lines.write('\x1b[31m[ERROR] in vain\n\x1b[0m')
+    screen, texts = stream()
+    lines_of('/me', screen).write('\x1b[31m[ERROR] in vain\n\x1b[0m')
     assert texts == ['[/me] \x1b[31m[ERROR] in vain\x1b[0m\n']
 
 
+PROGRESS = {
+    True: '[/me] ..\n[/me] \rspeed 1\rspeed 2\n[/other] hello\n[/me] done\n',
+    False: '[/me] .\n[/me] .\n[/me] \n[/me] \rspeed 1\n[/me] \rspeed 2\n[/other] hello\n[/me] done\n',
+}
+
+
+@pytest.mark.parametrize('is_terminal', PROGRESS)
+def test_progress_stays_in_its_line_on_a_terminal(is_terminal):
+    screen, texts = stream(is_terminal)
+    mine, others = lines_of('/me', screen), lines_of('/other', screen)
+    for text in '.', '.', '\n', '\rspeed 1', '\rspeed 2':
+        print(text, end='', file=mine, flush=True)
+    print('hello', file=others)
+    print('done', file=mine)
+    assert ''.join(texts) == PROGRESS[is_terminal]
+
+
 def test_flush_beside_other_threads_loses_nothing():
-    texts = []
-    terminal = types.SimpleNamespace(write=texts.append, flush=lambda: time.sleep(0))
-    lines = NamedLines(terminal, types.SimpleNamespace(name='/me'))
+    screen, texts = stream(flush=lambda: time.sleep(0))
+    lines = lines_of('/me', screen)
 
     def write():
         for _ in range(1000):

@@ -585,6 +585,8 @@ class NamedLines:
     """
 
     closed = False
+    #: the NamedLines whose text on the terminal has no line end yet, such as a progress bar, or None
+    open_line_owner: NamedLines | None = None
 
     def __init__(self, stream: Any, run: ScriptRun) -> None:
         self._stream = stream
@@ -614,18 +616,25 @@ class NamedLines:
         ended_text = text.replace(f'\n{COLOR_END}', f'{COLOR_END}\n')
         with self._lock:  # other threads print, too
             *lines, self._partial_line = (self._partial_line + ended_text).split('\n')
-        self._write(lines)
+        if lines:
+            self._write(lines)
         return len(text)
 
     def flush(self) -> None:
-        """Write the rest of the text as a line."""
+        """Write the rest of the text: on a terminal as it is, elsewhere as a line."""
         with self._lock:
             text, self._partial_line = self._partial_line, ''
         if text:
-            self._write([text])
+            self._write([text], '' if self._stream.isatty() else '\n')
 
-    def _write(self, lines: list[str]) -> None:
-        text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)
+    def _write(self, lines: list[str], end: str = '\n') -> None:
+        name = f'[{self._run.name}] '
+        text = name + f'\n{name}'.join(lines) + end
+        if NamedLines.open_line_owner is self:
+            text = text[len(name) :]
+        elif NamedLines.open_line_owner:
+            text = f'\n{text}'
+        NamedLines.open_line_owner = None if end else self
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
