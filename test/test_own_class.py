@@ -1,6 +1,7 @@
 """Classes and blocks of users: their names, parameters, mistakes, and the order of their start."""
 import collections
 import concurrent.futures
+import contextlib
 import functools
 import threading
 import time
@@ -241,6 +242,45 @@ def test_stop_has_the_last_word(master, sender, other, way, work):
     diary.wait_for(lambda message: message.data == 'drove on')
     log.wait_for(lambda message: message.msg == 'drives on')
     assert [each.data for each in speeds.all()] == ['first', 'zero']
+
+
+@pytest.mark.parametrize('error', [None, OSError('no gripper')], ids=['no super', 'raises'])
+def test_node_that_goes_on_after_its_stop_sends_on(master, other, error):
+    class Careless(Node):
+        def stop(self):
+            self.send_to('/speed', typed_as=STRING, data='zero')
+            if error:
+                raise error
+
+    box = Mailbox(other, '/speed', STRING)
+    node = create(master, '/careless', Careless)
+    with pytest.raises(OSError) if error else contextlib.nullcontext():
+        node.stop()
+    threading.Thread(target=node.send_to, args=['/speed', 'on']).start()
+    assert [box.next().data for _ in 'ab'] == ['zero', 'on']
+    Node.stop(node)
+
+
+def test_second_stop_does_not_take_the_last_word(master, other):
+    """As that of a `with` at Ctrl-C: the first one brakes in two steps."""
+
+    class Braking(Node):
+        braking = second = None
+
+        def stop(self):
+            if self.braking:
+                return
+            self.braking = True
+            self.send_to('/speed', typed_as=STRING, data='slow')
+            self.second = threading.Thread(target=self.stop)
+            self.second.start()
+            self.second.join(TIMEOUT)
+            self.send_to('/speed', typed_as=STRING, data='zero')
+            super().stop()
+
+    box = Mailbox(other, '/speed', STRING)
+    create(master, '/braking', Braking).stop()
+    assert [box.next().data for _ in 'ab'] == ['slow', 'zero']
 
 
 def test_node_becomes_another_class_after_the_delegate(master):

@@ -766,6 +766,14 @@ def test_progress_stays_in_its_line_on_a_terminal(is_terminal):
     assert ''.join(texts) == PROGRESS[is_terminal]
 
 
+def test_open_line_of_a_terminal_leaves_files_alone():
+    screen, _ = stream(is_terminal=True)
+    file, texts = stream()
+    print('50 %', end='', file=lines_of('/me', screen), flush=True)
+    print('hello', file=lines_of('/me', file))
+    assert texts == ['[/me] hello\n']
+
+
 def test_flush_beside_other_threads_loses_nothing():
     screen, texts = stream(flush=lambda: time.sleep(0))
     lines = lines_of('/me', screen)

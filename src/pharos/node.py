@@ -119,8 +119,13 @@ class Node(DelegateHolder):
             def stop(self: Node, *args: Any, **kwargs: Any) -> Any:
                 if not self._is_active:
                     return None
-                self._current_run.last_thread = threading.get_ident()
-                value = own_stop(self, *args, **kwargs)
+                run = self._current_run
+                former_thread = run.last_thread  # that of a stop() that goes on
+                run.last_thread = former_thread or threading.get_ident()
+                try:
+                    value = own_stop(self, *args, **kwargs)
+                finally:
+                    run.last_thread = former_thread
                 if self.is_running:
                     self.log(f'{cls.__name__}.stop() must call super().stop()', 'error')
                 return value
@@ -229,8 +234,7 @@ class Node(DelegateHolder):
         """Stop the node, even if the stop() of its class raises; for any number of threads."""
         with self._life_lock:
             try:
-                if self.is_running:
-                    self.stop()
+                self.stop()
             except Exception as error:
                 self._current_run.report_failure(error, self.stop, 'method')
             finally:
@@ -245,18 +249,16 @@ class Node(DelegateHolder):
 
         :raises MasterUnreachableError: if the master does not answer; the node runs on
         """
-        if not self._current_run:
-            self._check_active()  # raises
         with self._life_lock:
+            former_run = self._last_run
             self._settings.master.call('getPid')  # raises if the master does not answer
-            former_run = self._current_run
             live_souls = list(former_run.souls.values())
-            signals.restarting_nodes.append(self)  # or spin() would return
+            signals.started_nodes.append(self)  # once more, or spin() would return
             try:
                 self.stop()
                 self._start_held()
             finally:
-                signals.restarting_nodes.remove(self)
+                signals.started_nodes.remove(self)
             if not self._has_own_start:
                 names = [name for name, *_ in live_souls]
                 broken_souls = [
@@ -307,6 +309,16 @@ class Node(DelegateHolder):
             )
 
     @property
+    def _last_run(self) -> Run:
+        """The run that goes on, or else the last one.
+
+        :raises NodeStoppedError: before the first start
+        """
+        if not self._current_run:
+            self._check_active()
+        return self._current_run
+
+    @property
     def _is_active(self) -> bool:
         """True if the node runs, or its stop goes on."""
         return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
@@ -335,9 +347,7 @@ class Node(DelegateHolder):
 
         After a stop it is the last run's, whose ``is_shutdown()`` is True: a loop on it ends.
         """
-        if not self._current_run:
-            self._check_active()  # raises
-        return self._current_run.ros
+        return self._last_run.ros
 
     def ros_import(self, name: str) -> Any:
         """Return a private copy, for this run, of a library on rospy such as 'actionlib'."""
@@ -357,13 +367,12 @@ class Node(DelegateHolder):
             now), ``waiting`` (number of messages), ``lock`` (a text if an import has turned the lock of a
             free-threaded Python on again, else '')
         """
-        if not self._current_run:
-            self._check_active()  # raises
+        run = self._last_run
         registered = None
         with suppress(MasterUnreachableError):
             uri = self._settings.master.call('lookupNode', self._settings.name)
-            registered = uri == self._current_run.uri
-        return types.SimpleNamespace(registered=registered, **self._current_run.health_facts())
+            registered = uri == run.uri
+        return types.SimpleNamespace(registered=registered, **run.health_facts())
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return the node's topics, services, peers and rates as text; count for some seconds."""

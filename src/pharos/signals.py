@@ -15,12 +15,10 @@ import rospy
 SAME_SIGNAL = 1.0  # seconds; people press Ctrl-C twice, and `timeout -s INT` sends two signals
 _SPIN_PERIOD = 0.01  # seconds
 
-#: the nodes of this process that have started
+#: the nodes of this process that have started; during a restart() a node stands here once more
 started_nodes = []
 #: the names of nodes that a required soul has ended
 lost_names = set()
-#: the nodes in a restart()
-restarting_nodes = []
 
 #: identifiers of threads whose handlers of a signal run in another thread: what they publish meanwhile
 #: is dropped, since their process would stand still. (Only compose runs handlers in another thread.)
@@ -33,12 +31,12 @@ _is_exiting = False
 
 def own_nodes():
     """Return the nodes of this process that start, run, stop or restart."""
-    return [*dict.fromkeys(started_nodes + restarting_nodes)]
+    return [*dict.fromkeys(started_nodes)]
 
 
 def live_nodes():
     """Return the nodes of this process that start or run."""
-    return [node for node in started_nodes if not node._current_run.stopping.is_set()]
+    return [node for node in own_nodes() if not node._current_run.stopping.is_set()]
 
 
 class QuietWait(contextlib.AbstractContextManager):
@@ -159,7 +157,6 @@ def _forget_nodes() -> None:
     for node in own_nodes():
         node._current_run.mark_stopped()
     started_nodes.clear()
-    restarting_nodes.clear()
 
 
 atexit.register(_stop_at_exit)

@@ -297,6 +297,8 @@ class ScriptRun(Run):
             for stream in self.own_sys.stdout, self.own_sys.stderr, self.stdout, self.stderr:
                 with contextlib.suppress(Exception):  # the program has closed it, or given it away
                     stream.flush()
+            if NamedLines.open_line_owner in (self.stdout, self.stderr):
+                NamedLines.open_line_owner._write([''])  # the line ends
             if self.node._current_run is self:  # else the node has started again before this end
                 if self.exit_request is not None:
                     status = self._status_of(self.exit_request)
@@ -630,11 +632,12 @@ class NamedLines:
     def _write(self, lines: list[str], end: str = '\n') -> None:
         name = f'[{self._run.name}] '
         text = name + f'\n{name}'.join(lines) + end
-        if NamedLines.open_line_owner is self:
-            text = text[len(name) :]
-        elif NamedLines.open_line_owner:
-            text = f'\n{text}'
-        NamedLines.open_line_owner = None if end else self
+        if self._stream.isatty():
+            if NamedLines.open_line_owner is self:
+                text = text[len(name) :]
+            elif NamedLines.open_line_owner:
+                text = f'\n{text}'
+            NamedLines.open_line_owner = None if end else self
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)

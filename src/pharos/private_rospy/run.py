@@ -212,7 +212,7 @@ class Run:
         at once: the caller must not hear of a success. So does a timer's: it would call once more.
         """
         if self.finished.is_set():
-            raise SystemExit  # in a thread that was left behind
+            raise SystemExit(f'{self.name} has stopped')  # in a thread that was left behind
         if seconds <= 0:
             let_others_run()
             return
