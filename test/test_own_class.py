@@ -265,17 +265,21 @@ def test_second_stop_does_not_take_the_last_word(master, other):
     """As that of a `with` at Ctrl-C: the first one brakes in two steps."""
 
     class Braking(Node):
-        braking = second = None
+        braking = None
 
         def stop(self):
             if self.braking:
+                self.braking.set()
+                self.zeroed.wait(TIMEOUT)
                 return
-            self.braking = True
+            self.braking, self.zeroed = threading.Event(), threading.Event()
             self.send_to('/speed', typed_as=STRING, data='slow')
-            self.second = threading.Thread(target=self.stop)
-            self.second.start()
-            self.second.join(TIMEOUT)
+            second = threading.Thread(target=self.stop)
+            second.start()
+            assert self.braking.wait(TIMEOUT)
             self.send_to('/speed', typed_as=STRING, data='zero')
+            self.zeroed.set()
+            second.join(TIMEOUT)
             super().stop()
 
     box = Mailbox(other, '/speed', STRING)
