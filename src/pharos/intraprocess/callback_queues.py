@@ -75,8 +75,8 @@ class CallbackQueue:
     :ivar pause_end: the time when the pause ends, as of perf_counter(); 0 after the pause. No callback
         begins before it, unless release() ends the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or waits for their turn; or None
-    :ivar thread: the thread of the queue, from the first message on; None if the thread has ended by an
-        exception
+    :ivar thread: the thread of the queue; False before the first message, None if the system had no
+        thread left, or the thread has ended by an exception
     :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
     """
 
@@ -85,7 +85,7 @@ class CallbackQueue:
     begin_time: float | None = None
     # True if the last callback took longer than SLOW; stays as it was while the node has one queue
     _was_slow = False
-    thread = None
+    thread: Any = False
 
     def __init__(self, order: CallbackOrder, first_pause: float = 0.0) -> None:
         self.order = order

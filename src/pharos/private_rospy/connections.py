@@ -208,9 +208,12 @@ def _check_peers(run):
 
 
 def _start_threads(run):
-    """Start the threads of callback queues that the system had no thread for."""
+    """Start the threads of callback queues that the system had no thread for.
+
+    Only the publisher of its first message starts a new one: in virtual time that has a turn for it.
+    """
     for queue in list(run.callback_queue.order.queues):
-        if not queue.thread:
+        if queue.thread is None:
             queue.request_thread()
 
 
